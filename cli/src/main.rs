@@ -1,0 +1,3 @@
+//! The `pantaray` command.
+
+fn main() {}

@@ -1,0 +1,6 @@
+//! Boxes, hashing and the few functions whose bits must be the same everywhere.
+
+pub mod bounds;
+pub mod hash;
+
+pub use bounds::Bounds;

@@ -1,0 +1,1 @@
+//! The words that server, worker and command line share. No I/O.

@@ -1,0 +1,1 @@
+//! The coordinator: submissions, queue and leases over HTTP. Not built yet.

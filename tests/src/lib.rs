@@ -1,0 +1,1 @@
+//! What the tests share: small scenes, temporary folders, running the command.

@@ -1,0 +1,1 @@
+//! The farm worker: claims batches, traces them, uploads parts. Not built yet.
