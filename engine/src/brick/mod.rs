@@ -2,7 +2,8 @@
 //!
 //! A brick is a treelet of at most 256 nodes with all its leaves, contiguous in memory and on disk. Inside it, all
 //! references are 8 to 14 bits; a child may be another brick. [`lattice`] has the integer coordinates, [`node`] and
-//! [`leaf`] the two records, [`intersect`] rays against faces, [`walk`] any hit over bricks.
+//! [`leaf`] the two records, [`intersect`] rays against faces, [`bundle`] the rays of a few points, [`lanes`] the inner
+//! loops per instruction set, [`walk`] any hit over bricks.
 //!
 //! ```text
 //! byte  0  magic          4 bytes  "PBRK"
@@ -16,9 +17,13 @@
 //!      64  nodes, 128 bytes each; then the table of brick numbers, u32 each; then, from a multiple of 8, the leaves
 //! ```
 
+pub mod bundle;
+pub mod intersect;
+pub mod lanes;
 pub mod lattice;
 pub mod leaf;
 pub mod node;
+pub mod walk;
 
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -89,6 +94,7 @@ impl<'a> Brick<'a> {
         if (0..children).any(|index| brick.child_brick(index) >= bricks) {
             return corrupt("a child brick is not in the map");
         }
+        let mut has_parent = [false; NODES_MAX];
         for index in 0..nodes {
             let node = brick.node(index);
             if usize::from(node.count) > node::WIDTH || node.exponent.iter().any(|&e| e > 23) {
@@ -96,8 +102,11 @@ impl<'a> Brick<'a> {
             }
             for slot in 0..usize::from(node.count) {
                 let sound = match node.child(slot) {
-                    // Children come after their parents: no cycles
-                    Some(Child::Node(child)) => usize::from(child) > index && usize::from(child) < nodes,
+                    // Children come after their parents and have one only: no cycles, no blow-up
+                    Some(Child::Node(child)) => {
+                        let child = usize::from(child);
+                        child > index && child < nodes && !std::mem::replace(&mut has_parent[child], true)
+                    }
                     Some(Child::Brick(child)) => usize::from(child) < children,
                     Some(Child::Leaf(offset)) => {
                         let at = 8 * usize::from(offset);

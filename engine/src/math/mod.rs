@@ -2,5 +2,6 @@
 
 pub mod bounds;
 pub mod hash;
+pub mod trig;
 
 pub use bounds::Bounds;

@@ -1,3 +1,5 @@
-//! What is computed at a point: the mathematics of spherical harmonics and the shaders that use it.
+//! Shaders: what is computed at the points of a bake set (paper, section 4.2).
 
+pub mod sample;
 pub mod sh;
+pub mod sh_occlusion;

@@ -1,0 +1,155 @@
+//! A bundle: all rays of one or a few neighbouring points, which pass through the bricks together.
+//!
+//! Rays are known by 16-bit numbers. Everything is in lattice steps relative to the bundle's reference point, so
+//! that single precision is exact where it matters: near the origins.
+
+use glam::{IVec3, Vec3};
+
+/// Rays of a bundle at most.
+pub const RAYS_MAX: usize = 2048;
+/// Points of a bundle at most.
+pub const POINTS_MAX: usize = 8;
+
+/// What a box test reads of a ray.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(32))]
+pub struct BoxRay {
+    /// Reciprocal direction.
+    pub inverse: [f32; 4],
+    /// Origin times reciprocal direction.
+    pub offset: [f32; 4],
+}
+
+/// One origin of a bundle and its range of rays.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Origin {
+    /// Lattice coordinates.
+    pub position: IVec3,
+    /// First ray.
+    pub first: u16,
+    /// One past the last ray.
+    pub end: u16,
+}
+
+/// The rays of a few neighbouring points.
+#[derive(Debug)]
+pub struct Bundle {
+    /// What everything is relative to: the first origin, in lattice coordinates.
+    pub reference: IVec3,
+    /// The origins, in the order of their rays.
+    pub origins: Vec<Origin>,
+    /// Box of the origins, relative to the reference.
+    pub bounds: [Vec3; 2],
+    /// For box tests.
+    pub box_rays: Vec<BoxRay>,
+    /// Unit directions; the fourth component is 0.
+    pub directions: Vec<[f32; 4]>,
+    /// Extinction met so far.
+    pub extinction: Vec<u32>,
+    /// A ray ends when its extinction passes this.
+    pub limit: Vec<u32>,
+    /// Bit i: ray i has not ended.
+    pub alive: [u16; RAYS_MAX / 16],
+    /// Rays end after this many steps; infinite if nothing limits them.
+    pub reach: f32,
+    /// Hits nearer than this many steps are tested again in double precision.
+    pub near: f32,
+}
+
+/// Extinction that no limit reaches: what an opaque face adds.
+pub const EXTINCTION_OPAQUE: u32 = 1 << 24;
+
+impl Bundle {
+    /// An empty bundle with memory for [`RAYS_MAX`] rays.
+    pub fn new() -> Self {
+        Self {
+            reference: IVec3::ZERO,
+            origins: Vec::with_capacity(POINTS_MAX),
+            bounds: [Vec3::ZERO; 2],
+            box_rays: Vec::with_capacity(RAYS_MAX),
+            directions: Vec::with_capacity(RAYS_MAX),
+            extinction: Vec::with_capacity(RAYS_MAX),
+            limit: Vec::with_capacity(RAYS_MAX),
+            alive: [0; RAYS_MAX / 16],
+            reach: f32::INFINITY,
+            near: 0.0,
+        }
+    }
+
+    /// Empties the bundle and sets what its rays have in common.
+    pub fn clear(&mut self, reach: f32, near: f32) {
+        self.origins.clear();
+        self.box_rays.clear();
+        self.directions.clear();
+        self.extinction.clear();
+        self.limit.clear();
+        self.alive = [0; RAYS_MAX / 16];
+        (self.reach, self.near) = (reach, near);
+    }
+
+    /// Rays.
+    pub fn len(&self) -> usize {
+        self.directions.len()
+    }
+
+    /// Whether there are no rays.
+    pub fn is_empty(&self) -> bool {
+        self.directions.is_empty()
+    }
+
+    /// Starts a new origin; rays pushed from now on belong to it.
+    pub fn push_origin(&mut self, position: IVec3) {
+        if self.origins.is_empty() {
+            self.reference = position;
+            self.bounds = [Vec3::ZERO; 2];
+        }
+        let relative = (position - self.reference).as_vec3();
+        self.bounds = [self.bounds[0].min(relative), self.bounds[1].max(relative)];
+        let first = self.len() as u16;
+        self.origins.push(Origin { position, first, end: first });
+    }
+
+    /// Adds a ray of the newest origin. `limit` is the extinction at which it ends.
+    #[inline(always)]
+    pub fn push_ray(&mut self, direction: Vec3, limit: u32) {
+        let ray = self.len();
+        debug_assert!(ray < RAYS_MAX);
+        let Some(origin) = self.origins.last_mut() else { return };
+        let relative = (origin.position - self.reference).as_vec3();
+        // A component of zero would make 0 * infinity; a tiny one is as good
+        let inverse =
+            direction.to_array().map(|d| 1.0 / if d.abs() < 1e-18 { 1e-18_f32.copysign(d) } else { d });
+        let offset = [relative.x * inverse[0], relative.y * inverse[1], relative.z * inverse[2], 0.0];
+        self.box_rays.push(BoxRay { inverse: [inverse[0], inverse[1], inverse[2], 0.0], offset });
+        self.directions.push([direction.x, direction.y, direction.z, 0.0]);
+        self.extinction.push(0);
+        self.limit.push(limit);
+        self.alive[ray / 16] |= 1 << (ray % 16);
+        origin.end = ray as u16 + 1;
+    }
+
+    /// Adds extinction to a ray and ends it if that passes its limit. Whether it lives on.
+    #[inline(always)]
+    pub fn extinguish(&mut self, ray: u16, extinction: u32) -> bool {
+        let ray = usize::from(ray);
+        let total = self.extinction[ray].saturating_add(extinction);
+        self.extinction[ray] = total;
+        let ends = total > self.limit[ray];
+        if ends {
+            self.alive[ray / 16] &= !(1 << (ray % 16));
+        }
+        !ends
+    }
+
+    /// Whether a ray has not ended.
+    #[inline(always)]
+    pub fn is_alive(&self, ray: u16) -> bool {
+        self.alive[usize::from(ray) / 16] >> (ray % 16) & 1 != 0
+    }
+}
+
+impl Default for Bundle {
+    fn default() -> Self {
+        Self::new()
+    }
+}

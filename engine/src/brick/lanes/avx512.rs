@@ -1,0 +1,276 @@
+//! The inner loops for AVX-512: 32 ray numbers, 16 triangles or 8 boxes at a time.
+//!
+//! Box tests use 256-bit vectors: a ray against eight boxes fills them exactly.
+
+use std::arch::x86_64::*;
+
+use glam::{IVec3, Vec3};
+
+use super::plain::{BOX_ERROR, Plain};
+use super::{Boxes, Lanes, Planes, SLACK};
+use crate::brick::bundle::{BoxRay, RAYS_MAX};
+use crate::brick::leaf::{HEADER_BYTES, Layout};
+use crate::brick::node::Node;
+
+/// The loops for AVX-512 F, BW, DQ, VL, VBMI and VBMI2.
+#[derive(Clone, Copy, Debug)]
+pub struct Avx512;
+
+/// Coordinates of more bits do not fit a 32-bit lane at every bit offset.
+const LANE_BITS_MAX: u8 = 25;
+
+impl Lanes for Avx512 {
+    #[inline(always)]
+    unsafe fn filter(alive: &[u16; RAYS_MAX / 16], ids: &[u16], out: &mut [u16]) -> usize {
+        debug_assert!(out.len() >= ids.len() + SLACK);
+        // SAFETY: loads are masked to `ids`; stores of 32 numbers stay within the slack; `alive` is 4 vectors long
+        unsafe {
+            let words: [__m512i; 4] =
+                std::array::from_fn(|i| _mm512_loadu_si512(alive.as_ptr().add(32 * i).cast()));
+            let (fifteen, one) = (_mm512_set1_epi16(15), _mm512_set1_epi16(1));
+            let mut count = 0;
+            for chunk in ids.chunks(32) {
+                let present = u32::MAX >> (32 - chunk.len());
+                let ids = _mm512_maskz_loadu_epi16(present, chunk.as_ptr().cast());
+                let word = _mm512_srli_epi16::<4>(ids);
+                let lower = _mm512_permutex2var_epi16(words[0], word, words[1]);
+                let upper = _mm512_permutex2var_epi16(words[2], word, words[3]);
+                let is_upper = _mm512_test_epi16_mask(word, _mm512_set1_epi16(64));
+                let bits = _mm512_mask_blend_epi16(is_upper, lower, upper);
+                let bit = _mm512_srlv_epi16(bits, _mm512_and_si512(ids, fifteen));
+                let keep = _mm512_mask_test_epi16_mask(present, bit, one);
+                let kept = _mm512_maskz_compress_epi16(keep, ids);
+                _mm512_storeu_si512(out.as_mut_ptr().add(count).cast(), kept);
+                count += keep.count_ones() as usize;
+            }
+            count
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn boxes(node: &Node, reference: IVec3, origins: &[Vec3; 2], out: &mut Boxes) {
+        // SAFETY: loads are of 8 bytes of the node's own arrays; `out` is made of arrays of 8
+        unsafe {
+            let mut distance2 = _mm256_setzero_ps();
+            let mut diagonal2 = _mm256_setzero_ps();
+            for axis in 0..3 {
+                let base = _mm256_set1_ps(node.origin[axis].wrapping_sub(reference[axis]) as f32);
+                let scale = f32::from_bits((u32::from(node.exponent[axis]) + 127) << 23);
+                let half_scale = _mm256_set1_ps(0.5 * scale);
+                let (first, last) = (origins[0][axis], origins[1][axis]);
+                let reach = _mm256_set1_ps(first.abs().max(last.abs()));
+                let load = |bytes: &[u8; 8]| {
+                    _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(bytes.as_ptr().cast())))
+                };
+                let (lower, upper) = (load(&node.lower[axis]), load(&node.upper[axis]));
+                let center = _mm256_fmadd_ps(_mm256_add_ps(lower, upper), half_scale, base);
+                let half = _mm256_mul_ps(_mm256_sub_ps(upper, lower), half_scale);
+                let below = _mm256_sub_ps(_mm256_set1_ps(first), _mm256_add_ps(center, half));
+                let above = _mm256_sub_ps(_mm256_sub_ps(center, half), _mm256_set1_ps(last));
+                let gap = _mm256_max_ps(_mm256_max_ps(below, above), _mm256_setzero_ps());
+                distance2 = _mm256_fmadd_ps(gap, gap, distance2);
+                diagonal2 = _mm256_fmadd_ps(_mm256_mul_ps(_mm256_set1_ps(4.0), half), half, diagonal2);
+                let size = _mm256_add_ps(_mm256_add_ps(absolute(center), half), reach);
+                let padded = _mm256_fmadd_ps(size, _mm256_set1_ps(BOX_ERROR), half);
+                _mm256_storeu_ps(out.center[axis].as_mut_ptr(), center);
+                _mm256_storeu_ps(out.half[axis].as_mut_ptr(), padded);
+            }
+            _mm256_storeu_ps(out.distance2.as_mut_ptr(), distance2);
+            _mm256_storeu_ps(out.diagonal2.as_mut_ptr(), diagonal2);
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) {
+        debug_assert!(masks.len() >= ids.len());
+        // SAFETY: ids are below the number of rays; there is a mask for each
+        unsafe {
+            let load = |row: &[f32; 8]| _mm256_loadu_ps(row.as_ptr());
+            let center = [load(&boxes.center[0]), load(&boxes.center[1]), load(&boxes.center[2])];
+            let half = [load(&boxes.half[0]), load(&boxes.half[1]), load(&boxes.half[2])];
+            for (i, &id) in ids.iter().enumerate() {
+                let ray = rays.get_unchecked(usize::from(id));
+                let mut enter = _mm256_setzero_ps();
+                let mut leave = _mm256_set1_ps(f32::MAX);
+                for axis in 0..3 {
+                    let inverse = _mm256_broadcast_ss(&ray.inverse[axis]);
+                    let offset = _mm256_broadcast_ss(&ray.offset[axis]);
+                    let middle = _mm256_fmsub_ps(center[axis], inverse, offset);
+                    let steep = absolute(inverse);
+                    enter = _mm256_max_ps(_mm256_fnmadd_ps(half[axis], steep, middle), enter);
+                    leave = _mm256_min_ps(_mm256_fmadd_ps(half[axis], steep, middle), leave);
+                }
+                *masks.get_unchecked_mut(i) = _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave);
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn select(ids: &[u16], masks: &[u8], slot: usize, out: &mut [u16]) -> usize {
+        debug_assert!(out.len() >= ids.len() + SLACK && masks.len() >= ids.len() + SLACK);
+        // SAFETY: loads of ids are masked; masks and `out` have the slack
+        unsafe {
+            let bit = _mm256_set1_epi8((1_u8 << slot) as i8);
+            let mut count = 0;
+            for (i, chunk) in ids.chunks(32).enumerate() {
+                let present = u32::MAX >> (32 - chunk.len());
+                let ids = _mm512_maskz_loadu_epi16(present, chunk.as_ptr().cast());
+                let masks = _mm256_loadu_si256(masks.as_ptr().add(32 * i).cast());
+                let keep = _mm256_mask_test_epi8_mask(present, masks, bit);
+                _mm512_storeu_si512(
+                    out.as_mut_ptr().add(count).cast(),
+                    _mm512_maskz_compress_epi16(keep, ids),
+                );
+                count += keep.count_ones() as usize;
+            }
+            count
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn planes(leaf: &[u8], layout: &Layout, origin: IVec3, out: &mut Planes) {
+        if layout.bits.iter().any(|&bits| bits > LANE_BITS_MAX) {
+            // SAFETY: the caller's
+            return unsafe { Plain::planes(leaf, layout, origin, out) };
+        }
+        debug_assert!(leaf.len() >= layout.bytes + crate::brick::leaf::READ_PAST_BYTES);
+        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 32 bytes from byte 20,
+        // and 16 coordinates start within the leaf
+        unsafe {
+            // Unpack the vertices relative to the origin
+            let many = layout.vertices > 16;
+            let zero = _mm512_setzero_si512();
+            let (mut first, mut second) = ([zero; 3], [zero; 3]);
+            let mut at_origin = [!0_u16; 2];
+            for axis in 0..3 {
+                let bits = layout.bits[axis];
+                let base = _mm512_set1_epi32(layout.origin[axis].wrapping_sub(origin[axis]));
+                let shift = _mm_cvtsi32_si128(i32::from(layout.shift));
+                let packed = leaf.as_ptr().add(layout.coordinates[axis]);
+                first[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpack(packed, bits), shift), base);
+                at_origin[0] &= _mm512_cmpeq_epi32_mask(first[axis], zero);
+                if many {
+                    let packed = packed.add(2 * usize::from(bits));
+                    second[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpack(packed, bits), shift), base);
+                    at_origin[1] &= _mm512_cmpeq_epi32_mask(second[axis], zero);
+                }
+            }
+
+            // Read the corners' indices, 8 faces at a time
+            let indices = leaf.as_ptr().add(HEADER_BYTES);
+            let corner: [__m256i; 4] = if layout.byte_indices {
+                let words = _mm256_loadu_si256(indices.cast());
+                let mask = _mm256_set1_epi32(31);
+                [
+                    _mm256_and_si256(words, mask),
+                    _mm256_and_si256(_mm256_srli_epi32::<8>(words), mask),
+                    _mm256_and_si256(_mm256_srli_epi32::<16>(words), mask),
+                    _mm256_and_si256(_mm256_srli_epi32::<24>(words), mask),
+                ]
+            } else {
+                let words = _mm256_cvtepu16_epi32(_mm_loadu_si128(indices.cast()));
+                let mask = _mm256_set1_epi32(15);
+                [
+                    _mm256_and_si256(words, mask),
+                    _mm256_and_si256(_mm256_srli_epi32::<4>(words), mask),
+                    _mm256_and_si256(_mm256_srli_epi32::<8>(words), mask),
+                    _mm256_srli_epi32::<12>(words),
+                ]
+            };
+            let pair = |low, high| _mm512_inserti64x4::<1>(_mm512_castsi256_si512(low), high);
+            let lanes = [pair(corner[0], corner[0]), pair(corner[1], corner[2]), pair(corner[2], corner[3])];
+
+            // Exclude faces with a corner at the origin
+            let present = ((1_u32 << layout.faces) - 1) as u16;
+            let mut valid = present | present << 8;
+            let touched = u32::from(at_origin[0]) | u32::from(if many { at_origin[1] } else { 0 }) << 16;
+            let touched = if layout.vertices < 32 { touched & ((1 << layout.vertices) - 1) } else { touched };
+            if touched != 0 {
+                let bits = _mm256_set1_epi32(touched as i32);
+                let touches = corner.map(|c| _mm256_srlv_epi32(bits, c));
+                let any = _mm256_or_si256(
+                    _mm256_or_si256(touches[0], touches[1]),
+                    _mm256_or_si256(touches[2], touches[3]),
+                );
+                let excluded = u16::from(_mm256_test_epi32_mask(any, _mm256_set1_epi32(1)));
+                valid &= !(excluded | excluded << 8);
+            }
+
+            // Gather the corners
+            let mut corners = [[_mm512_setzero_ps(); 3]; 3];
+            for axis in 0..3 {
+                let low = _mm512_cvtepi32_ps(first[axis]);
+                let high = _mm512_cvtepi32_ps(second[axis]);
+                for c in 0..3 {
+                    corners[c][axis] = if many {
+                        _mm512_permutex2var_ps(low, lanes[c], high)
+                    } else {
+                        _mm512_permutexvar_ps(lanes[c], low)
+                    };
+                }
+            }
+
+            // Make the planes; products are not fused, see the plain version
+            let [a, b, c] = corners;
+            let mut normals = [cross(a, b), cross(b, c), cross(c, a)];
+            let n = normals[1];
+            let volume = _mm512_fmadd_ps(a[2], n[2], _mm512_fmadd_ps(a[1], n[1], _mm512_mul_ps(a[0], n[0])));
+            valid &= _mm512_cmp_ps_mask::<_CMP_NEQ_OQ>(volume, _mm512_setzero_ps());
+            let sign = _mm512_and_ps(volume, _mm512_set1_ps(-0.0));
+            for (normal, out) in normals.iter_mut().zip(&mut out.normals) {
+                for (component, out) in normal.iter_mut().zip(out) {
+                    *component = _mm512_xor_ps(*component, sign);
+                    _mm512_storeu_ps(out.as_mut_ptr(), *component);
+                }
+            }
+            _mm512_storeu_ps(out.volume.as_mut_ptr(), _mm512_andnot_ps(_mm512_set1_ps(-0.0), volume));
+            out.valid = valid;
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn meet_planes(planes: &Planes, direction: &[f32; 4]) -> u16 {
+        // SAFETY: arrays of 16
+        unsafe {
+            let d: [__m512; 3] = std::array::from_fn(|axis| _mm512_set1_ps(direction[axis]));
+            let mut hits = planes.valid;
+            for normal in &planes.normals {
+                let n: [__m512; 3] = std::array::from_fn(|axis| _mm512_loadu_ps(normal[axis].as_ptr()));
+                let product =
+                    _mm512_fmadd_ps(d[2], n[2], _mm512_fmadd_ps(d[1], n[1], _mm512_mul_ps(d[0], n[0])));
+                hits = _mm512_mask_cmp_ps_mask::<_CMP_GE_OQ>(hits, product, _mm512_setzero_ps());
+            }
+            hits
+        }
+    }
+}
+
+/// The 16 numbers of `bits` bits that start at `packed`.
+#[inline(always)]
+unsafe fn unpack(packed: *const u8, bits: u8) -> __m512i {
+    // SAFETY: the caller may read 64 bytes
+    unsafe {
+        let bytes = _mm512_loadu_si512(packed.cast());
+        let lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+        let bit = _mm512_mullo_epi32(lane, _mm512_set1_epi32(i32::from(bits)));
+        let byte = _mm512_mullo_epi32(_mm512_srli_epi32::<3>(bit), _mm512_set1_epi32(0x0101_0101));
+        let words = _mm512_permutexvar_epi8(_mm512_add_epi32(byte, _mm512_set1_epi32(0x0302_0100)), bytes);
+        let aligned = _mm512_srlv_epi32(words, _mm512_and_si512(bit, _mm512_set1_epi32(7)));
+        _mm512_and_si512(aligned, _mm512_set1_epi32((1 << bits) - 1))
+    }
+}
+
+#[inline(always)]
+unsafe fn absolute(x: __m256) -> __m256 {
+    // SAFETY: no memory is touched
+    unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), x) }
+}
+
+#[inline(always)]
+unsafe fn cross(p: [__m512; 3], q: [__m512; 3]) -> [__m512; 3] {
+    // SAFETY: no memory is touched
+    unsafe {
+        [(1, 2), (2, 0), (0, 1)]
+            .map(|(i, j)| _mm512_sub_ps(_mm512_mul_ps(p[i], q[j]), _mm512_mul_ps(p[j], q[i])))
+    }
+}

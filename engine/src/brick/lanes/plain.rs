@@ -1,0 +1,160 @@
+//! The inner loops over plain arrays. Compiled with AVX2 enabled they are the AVX2 version.
+
+use glam::{IVec3, Vec3};
+
+use super::{Boxes, Lanes, Planes};
+use crate::brick::bundle::{BoxRay, RAYS_MAX};
+use crate::brick::leaf::{FACES_MAX, Layout, VERTICES_MAX};
+use crate::brick::node::{Node, WIDTH};
+
+/// The plain loops.
+#[derive(Clone, Copy, Debug)]
+pub struct Plain;
+
+/// Relative error of box arithmetic: a few roundings of 2^-24.
+pub const BOX_ERROR: f32 = 1.0 / (1 << 21) as f32;
+
+impl Lanes for Plain {
+    #[inline(always)]
+    unsafe fn filter(alive: &[u16; RAYS_MAX / 16], ids: &[u16], out: &mut [u16]) -> usize {
+        let mut count = 0;
+        for &id in ids {
+            out[count] = id;
+            count += usize::from(alive[usize::from(id) / 16] >> (id % 16) & 1);
+        }
+        count
+    }
+
+    #[inline(always)]
+    unsafe fn boxes(node: &Node, reference: IVec3, origins: &[Vec3; 2], out: &mut Boxes) {
+        let mut distance2 = [0.0_f32; WIDTH];
+        let mut diagonal2 = [0.0_f32; WIDTH];
+        for axis in 0..3 {
+            let base = node.origin[axis].wrapping_sub(reference[axis]) as f32;
+            let scale = f32::from_bits((u32::from(node.exponent[axis]) + 127) << 23);
+            let reach = origins[0][axis].abs().max(origins[1][axis].abs());
+            for slot in 0..WIDTH {
+                let lower = f32::from(node.lower[axis][slot]);
+                let upper = f32::from(node.upper[axis][slot]);
+                let center = (lower + upper).mul_add(0.5 * scale, base);
+                let half = (upper - lower) * (0.5 * scale);
+                let below = origins[0][axis] - (center + half);
+                let above = (center - half) - origins[1][axis];
+                let gap = max(max(below, above), 0.0);
+                distance2[slot] = gap.mul_add(gap, distance2[slot]);
+                diagonal2[slot] = (4.0 * half).mul_add(half, diagonal2[slot]);
+                out.center[axis][slot] = center;
+                out.half[axis][slot] = (center.abs() + half + reach).mul_add(BOX_ERROR, half);
+            }
+        }
+        (out.distance2, out.diagonal2) = (distance2, diagonal2);
+    }
+
+    #[inline(always)]
+    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) {
+        for (&id, mask) in ids.iter().zip(masks) {
+            let ray = &rays[usize::from(id)];
+            let mut enter = [0.0_f32; WIDTH];
+            let mut leave = [f32::MAX; WIDTH];
+            for axis in 0..3 {
+                let (inverse, offset) = (ray.inverse[axis], ray.offset[axis]);
+                for slot in 0..WIDTH {
+                    let middle = boxes.center[axis][slot].mul_add(inverse, -offset);
+                    let half = boxes.half[axis][slot];
+                    enter[slot] = max((-half).mul_add(inverse.abs(), middle), enter[slot]);
+                    leave[slot] = min(half.mul_add(inverse.abs(), middle), leave[slot]);
+                }
+            }
+            *mask = (0..WIDTH).fold(0, |mask, slot| mask | u8::from(enter[slot] <= leave[slot]) << slot);
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn select(ids: &[u16], masks: &[u8], slot: usize, out: &mut [u16]) -> usize {
+        let mut count = 0;
+        for (&id, &mask) in ids.iter().zip(masks) {
+            out[count] = id;
+            count += usize::from(mask >> slot & 1);
+        }
+        count
+    }
+
+    #[inline(always)]
+    unsafe fn planes(leaf: &[u8], layout: &Layout, origin: IVec3, out: &mut Planes) {
+        let mut vertices = [[0_i32; VERTICES_MAX]; 3];
+        let mut at_origin = 0_u32;
+        for vertex in 0..layout.vertices {
+            let position = layout.vertex(leaf, vertex);
+            let relative = [0, 1, 2].map(|axis| position[axis].wrapping_sub(origin[axis]));
+            at_origin |= u32::from(relative == [0; 3]) << vertex;
+            for axis in 0..3 {
+                vertices[axis][vertex] = relative[axis];
+            }
+        }
+        let mut corners = [[[0.0_f32; 16]; 3]; 3];
+        let mut excluded = 0_u16;
+        for face in 0..FACES_MAX.min(layout.faces) {
+            let indices = [0, 1, 2, 3].map(|corner| layout.index(leaf, face, corner) % VERTICES_MAX);
+            let touches = indices.iter().any(|&index| at_origin >> index & 1 != 0);
+            excluded |= u16::from(touches) * (0x101 << face);
+            for axis in 0..3 {
+                let [a, b, c, d] = indices.map(|index| vertices[axis][index] as f32);
+                (corners[0][axis][face], corners[0][axis][face + 8]) = (a, a);
+                (corners[1][axis][face], corners[1][axis][face + 8]) = (b, c);
+                (corners[2][axis][face], corners[2][axis][face + 8]) = (c, d);
+            }
+        }
+        let [a, b, c] = &corners;
+        let edges = [[a, b], [b, c], [c, a]];
+        // Products are not fused: both faces of an edge get the same numbers with opposite signs
+        for (normal, [p, q]) in out.normals.iter_mut().zip(edges) {
+            for axis in 0..3 {
+                let (i, j) = ((axis + 1) % 3, (axis + 2) % 3);
+                for lane in 0..16 {
+                    normal[axis][lane] = p[i][lane] * q[j][lane] - p[j][lane] * q[i][lane];
+                }
+            }
+        }
+        let mut valid = 0_u16;
+        for lane in 0..16 {
+            let n = &out.normals[1];
+            let volume =
+                a[2][lane].mul_add(n[2][lane], a[1][lane].mul_add(n[1][lane], a[0][lane] * n[0][lane]));
+            let sign = 1.0_f32.copysign(volume);
+            out.normals.iter_mut().flatten().for_each(|normal| normal[lane] *= sign);
+            out.volume[lane] = volume.abs();
+            valid |= u16::from(volume != 0.0) << lane;
+        }
+        let present = ((1_u32 << layout.faces) - 1) as u16;
+        out.valid = valid & !excluded & (present | present << 8);
+    }
+
+    #[inline(always)]
+    unsafe fn meet_planes(planes: &Planes, direction: &[f32; 4]) -> u16 {
+        let mut hits = planes.valid;
+        for normal in &planes.normals {
+            let mut inside = 0;
+            for lane in 0..16 {
+                let product = direction[2].mul_add(
+                    normal[2][lane],
+                    direction[1].mul_add(normal[1][lane], direction[0] * normal[0][lane]),
+                );
+                inside |= u16::from(product >= 0.0) << lane;
+            }
+            hits &= inside;
+        }
+        hits
+    }
+}
+
+/// As the machines' instruction has it: the second operand if either is not a number.
+#[inline(always)]
+fn max(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// See [`max`].
+#[inline(always)]
+fn min(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
