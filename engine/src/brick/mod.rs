@@ -63,12 +63,12 @@ impl<'a> Brick<'a> {
 
     /// Checks everything that decoding relies on: magic, length, checksum, every reference, every leaf.
     ///
-    /// `length` is the brick's length as its directory says, `bricks` the number of bricks in the map; `bytes` runs
-    /// on at least [`leaf::READ_PAST_BYTES`] past the brick.
+    /// `length` and `number` are the brick's as its directory says; `bytes` runs on at least
+    /// [`leaf::READ_PAST_BYTES`] past the brick.
     ///
     /// # Errors
     /// [`ErrorKind::Corrupt`](crate::ErrorKind::Corrupt), without a place.
-    pub fn check(bytes: &'a [u8], length: usize, number: u32, bricks: u32) -> Result<Self> {
+    pub fn check(bytes: &'a [u8], length: usize, number: u32) -> Result<Self> {
         let brick = Self { bytes };
         let corrupt = |what: &str| {
             Err(Error::new(crate::ErrorKind::Corrupt, format!("brick {number}: {what}"))
@@ -91,8 +91,9 @@ impl<'a> Brick<'a> {
         if !(1..=NODES_MAX).contains(&nodes) || children > CHILDREN_MAX || leaves > length {
             return corrupt("impossible counts");
         }
-        if (0..children).any(|index| brick.child_brick(index) >= bricks) {
-            return corrupt("a child brick is not in the map");
+        // Child bricks come before their parents: no cycles
+        if (0..children).any(|index| brick.child_brick(index) >= number) {
+            return corrupt("a child brick does not come before it");
         }
         let mut has_parent = [false; NODES_MAX];
         for index in 0..nodes {
@@ -216,6 +217,20 @@ pub fn assemble(
     brick[8..16].copy_from_slice(&checksum.to_le_bytes());
 }
 
+/// Gives a brick that [`assemble`] made, and its references to other bricks, numbers that are higher by `base`.
+pub fn renumber(brick: &mut [u8], base: u32) {
+    let view = Brick::trusted(brick);
+    let table = HEADER_BYTES + view.node_count() * size_of::<Node>();
+    let (number, children) = (view.u32_at(16), view.child_count());
+    brick[16..20].copy_from_slice(&(number + base).to_le_bytes());
+    for child in brick[table..table + 4 * children].chunks_exact_mut(4) {
+        let number = u32::from_le_bytes([child[0], child[1], child[2], child[3]]);
+        child.copy_from_slice(&(number + base).to_le_bytes());
+    }
+    let checksum = xxh3_64(&brick[16..]);
+    brick[8..16].copy_from_slice(&checksum.to_le_bytes());
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -235,7 +250,7 @@ mod tests {
         node.children[0] = Child::Leaf(0).encode();
         node.children[1] = Child::Brick(0).encode();
         let mut bytes = Vec::new();
-        assemble(3, &mut [node], &[5], &leaves, 1, &mut bytes);
+        assemble(6, &mut [node], &[5], &leaves, 1, &mut bytes);
         let length = bytes.len();
         bytes.resize(length + leaf::READ_PAST_BYTES, 0);
         (bytes, length)
@@ -245,7 +260,7 @@ mod tests {
     #[test]
     fn an_assembled_brick_passes_its_check() {
         let (bytes, length) = small_brick();
-        let brick = Brick::check(&bytes, length, 3, 6).unwrap();
+        let brick = Brick::check(&bytes, length, 6).unwrap();
         assert_eq!((brick.node_count(), brick.child_brick(0), brick.micropolygons()), (1, 5, 1));
     }
 
@@ -256,11 +271,18 @@ mod tests {
         for bit in 0..8 * length {
             let mut damaged = bytes.clone();
             damaged[bit / 8] ^= 1 << (bit % 8);
-            assert!(Brick::check(&damaged, length, 3, 6).is_err(), "bit {bit}");
+            assert!(Brick::check(&damaged, length, 6).is_err(), "bit {bit}");
         }
-        assert!(Brick::check(&bytes, length - 64, 3, 6).is_err());
-        assert!(Brick::check(&bytes, length, 4, 6).is_err());
-        assert!(Brick::check(&bytes, length, 3, 5).is_err(), "child brick 5 of 5");
+        assert!(Brick::check(&bytes, length - 64, 6).is_err());
+        assert!(Brick::check(&bytes, length, 4).is_err());
+    }
+
+    /// Catches a renumbered brick that its check refuses.
+    #[test]
+    fn a_renumbered_brick_passes_its_check() {
+        let (mut bytes, length) = small_brick();
+        renumber(&mut bytes[..length], 100);
+        assert_eq!(Brick::check(&bytes, length, 106).unwrap().child_brick(0), 105);
     }
 
     /// Catches references out of bounds that a valid checksum hides: a hostile file, not a damaged one.
@@ -271,10 +293,10 @@ mod tests {
             node.count = 1;
             node.children[0] = child.encode();
             let mut bytes = Vec::new();
-            assemble(0, &mut [node], &[0], &[], 0, &mut bytes);
+            assemble(1, &mut [node], &[0], &[], 0, &mut bytes);
             let length = bytes.len();
             bytes.resize(length + leaf::READ_PAST_BYTES, 0);
-            assert!(Brick::check(&bytes, length, 0, 1).is_err(), "{child:?}");
+            assert!(Brick::check(&bytes, length, 1).is_err(), "{child:?}");
         }
     }
 }

@@ -220,8 +220,7 @@ impl Arena {
         let mut at = 0;
         for brick in first..first + count {
             let length = self.map.brick_bytes(brick) as usize;
-            Brick::check(&staging[at..], length, brick, self.map.brick_count())
-                .map_err(|error| error.at(self.map.path()))?;
+            Brick::check(&staging[at..], length, brick).map_err(|error| error.at(self.map.path()))?;
             let lines = (length / ALIGNMENT) as u32;
             if !self.make_room(lines) {
                 return Ok(brick - first);

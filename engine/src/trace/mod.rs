@@ -2,4 +2,4 @@
 
 pub mod stream;
 
-pub use stream::{BatchCounts, Shading, SphericalTracer, TraceOptions};
+pub use stream::{BatchCounts, Shading, SphericalTracer, TraceOptions, bake_set_hash};

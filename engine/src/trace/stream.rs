@@ -60,14 +60,19 @@ impl Shading {
     /// Prepares a shader for the bake set with the given name, whose points lie on a geometry of lattice shift `shift`
     /// (0 if it is no occluder).
     pub fn new(shader: &ShOcclusion, seed: u64, bake_set: &str, shift: u8) -> Self {
-        let hash = xxhash_rust::xxh3::xxh3_64(bake_set.as_bytes()) as u32;
-        Self { shader: shader.clone(), sampler: Sampler::new(shader.samples, seed, hash), shift }
+        let sampler = Sampler::new(shader.samples, seed, bake_set_hash(bake_set));
+        Self { shader: shader.clone(), sampler, shift }
     }
 
     /// Coefficients of a point.
     pub fn coefficients(&self) -> usize {
         (self.shader.bands * self.shader.bands) as usize
     }
+}
+
+/// The hash of a bake set's name that its rays' rotations start from: the low 32 bits of its xxh3.
+pub fn bake_set_hash(name: &str) -> u32 {
+    xxhash_rust::xxh3::xxh3_64(name.as_bytes()) as u32
 }
 
 /// What tracing a batch took.

@@ -1,0 +1,393 @@
+//! A brick map on disk: a folder of immutable objects.
+//!
+//! ```text
+//! manifest.json    version, lattice, counts, build parameters; written last
+//! directory        u64 per brick: offset / 64 in the upper 52 bits, length / 64 - 1 in the lower 12
+//! segment.0000 …   bricks in order, 1 GiB at most each; a brick does not straddle two
+//! ```
+//!
+//! Offsets count through all segments as if each had its full size. The folder appears under its name when it is
+//! complete. Every brick has its own checksum, the directory's is in the manifest.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+
+use glam::{I64Vec3, IVec3};
+use serde::{Deserialize, Serialize};
+use xxhash_rust::xxh3::xxh3_64;
+
+use super::farfield::FarField;
+use super::pack::ByteSplit;
+use crate::brick::lattice::SHIFT_MAX;
+use crate::brick::{ALIGNMENT, BYTES_MAX, Lattice, LatticeBox};
+use crate::math::Bounds;
+use crate::{Error, ErrorKind, Result};
+
+/// The version of bricks and map. Others are refused.
+pub const FORMAT_VERSION: u32 = 1;
+
+const SEGMENT_BYTES: u64 = 1 << 30;
+const LENGTH_BITS: u32 = 12;
+const _: () = assert!(BYTES_MAX / ALIGNMENT <= 1 << LENGTH_BITS);
+
+/// Bricks of a map at most: their numbers have 32 bits and some are set aside.
+const BRICKS_MAX: u64 = 0xffff_0000;
+
+/// What `manifest.json` says.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// [`FORMAT_VERSION`].
+    pub version: u32,
+    /// The lattice's step is `2^exponent` scene units.
+    pub lattice_exponent: i32,
+    /// The lattice's origin in steps.
+    pub lattice_origin: [i64; 3],
+    /// Lattice shift of each occluder stream.
+    pub shifts: Vec<u8>,
+    /// Lower corner of everything on the lattice.
+    pub low: [i32; 3],
+    /// Upper corner.
+    pub high: [i32; 3],
+    /// Bricks; the last one is the root.
+    pub bricks: u32,
+    /// Bytes of all bricks.
+    pub bytes: u64,
+    /// xxh3 of the directory, hexadecimal.
+    pub directory_hash: String,
+    /// Micropolygons in the map.
+    pub micropolygons: u64,
+    /// Microgrids that they came in.
+    pub grids: u64,
+    /// The far field.
+    pub far_field: FarField,
+    /// Where the bytes go.
+    pub split: ByteSplit,
+    /// Leaves, and nodes: with the counts above, how full they are.
+    pub leaves: u64,
+    /// Nodes.
+    pub nodes: u64,
+}
+
+/// Writes a brick map.
+#[derive(Debug)]
+pub struct MapWriter {
+    target: PathBuf,
+    temporary: PathBuf,
+    segment: Option<std::io::BufWriter<File>>,
+    offset: u64,
+    directory: Vec<u8>,
+    done: bool,
+}
+
+impl MapWriter {
+    /// Starts a map that will appear at `target`.
+    ///
+    /// # Errors
+    /// When the folder cannot be made.
+    pub fn create(target: &Path) -> Result<Self> {
+        let name = target.file_name().unwrap_or_default().to_string_lossy();
+        let temporary = target.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
+        if temporary.exists() {
+            std::fs::remove_dir_all(&temporary).map_err(|e| Error::io("remove", &temporary, e))?;
+        }
+        std::fs::create_dir_all(&temporary).map_err(|e| Error::io("create the folder", &temporary, e))?;
+        Ok(Self {
+            target: target.to_path_buf(),
+            temporary,
+            segment: None,
+            offset: 0,
+            directory: Vec::new(),
+            done: false,
+        })
+    }
+
+    /// Bricks written so far.
+    pub fn bricks(&self) -> u32 {
+        (self.directory.len() / 8) as u32
+    }
+
+    /// Writes bricks that lie one after the other in `bytes`.
+    ///
+    /// # Errors
+    /// When the disk is full or fails, or there are too many bricks.
+    pub fn write(&mut self, bytes: &[u8], lengths: &[u32]) -> Result<()> {
+        if (self.directory.len() / 8 + lengths.len()) as u64 > BRICKS_MAX {
+            return Err(Error::new(ErrorKind::Limit, format!("more than {BRICKS_MAX} bricks")));
+        }
+        let mut at = 0;
+        for &length in lengths {
+            let length = length as usize;
+            if self.offset % SEGMENT_BYTES + length as u64 > SEGMENT_BYTES {
+                self.offset = self.offset.next_multiple_of(SEGMENT_BYTES);
+            }
+            if self.offset % SEGMENT_BYTES == 0 {
+                self.finish_segment()?;
+                let path = self.temporary.join(segment_name(self.offset / SEGMENT_BYTES));
+                let file = File::create(&path).map_err(|e| Error::io("create", &path, e))?;
+                self.segment = Some(std::io::BufWriter::with_capacity(1 << 20, file));
+            }
+            let entry = ((self.offset / ALIGNMENT as u64) << LENGTH_BITS) | (length / ALIGNMENT - 1) as u64;
+            self.directory.extend_from_slice(&entry.to_le_bytes());
+            let segment = self.segment.as_mut().expect("opened above");
+            segment.write_all(&bytes[at..at + length]).map_err(|e| Error::io("write", &self.target, e))?;
+            self.offset += length as u64;
+            at += length;
+        }
+        Ok(())
+    }
+
+    fn finish_segment(&mut self) -> Result<()> {
+        let Some(segment) = self.segment.take() else { return Ok(()) };
+        let sync = || segment.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all();
+        sync().map_err(|e| Error::io("write", &self.target, e))
+    }
+
+    /// Writes directory and manifest, and gives the map its name. `directory_hash` and `split.directory` are filled in.
+    ///
+    /// # Errors
+    /// When the disk is full or fails.
+    pub fn finish(mut self, mut manifest: Manifest) -> Result<Manifest> {
+        self.finish_segment()?;
+        manifest.directory_hash = format!("{:016x}", xxh3_64(&self.directory));
+        manifest.split.directory = self.directory.len() as u64;
+        let write = |name: &str, bytes: &[u8]| {
+            let path = self.temporary.join(name);
+            let mut file = File::create(&path)?;
+            file.write_all(bytes)?;
+            file.sync_all()
+        };
+        let json = serde_json::to_vec_pretty(&manifest).map_err(|e| Error::invalid(e.to_string()))?;
+        let publish = || {
+            write("directory", &self.directory)?;
+            write("manifest.json", &json)?;
+            if self.target.exists() {
+                std::fs::remove_dir_all(&self.target)?;
+            }
+            std::fs::rename(&self.temporary, &self.target)
+        };
+        publish().map_err(|e| Error::io("write", &self.target, e))?;
+        self.done = true;
+        Ok(manifest)
+    }
+}
+
+impl Drop for MapWriter {
+    fn drop(&mut self) {
+        if !self.done {
+            // Nothing sensible can be done about a failure here
+            _ = std::fs::remove_dir_all(&self.temporary);
+        }
+    }
+}
+
+fn segment_name(number: u64) -> String {
+    format!("segment.{number:04}")
+}
+
+/// An open brick map.
+#[derive(Debug)]
+pub struct BrickMap {
+    path: PathBuf,
+    manifest: Manifest,
+    directory: Vec<u64>,
+    segments: Vec<File>,
+}
+
+impl BrickMap {
+    /// Opens the map in a folder.
+    ///
+    /// # Errors
+    /// When it is not there, of another version, or damaged.
+    pub fn open(path: &Path) -> Result<Self> {
+        let manifest = read_manifest(&path.join("manifest.json"))?;
+        let directory_path = path.join("directory");
+        let expected = 8 * u64::from(manifest.bricks);
+        let found =
+            std::fs::metadata(&directory_path).map_err(|e| Error::io("read", &directory_path, e))?.len();
+        if found != expected || manifest.bricks == 0 {
+            return Err(Error::corrupt(
+                &directory_path,
+                found.min(expected),
+                format!("{found} bytes, {expected} expected"),
+            )
+            .hint("build the brick map again"));
+        }
+        let bytes = std::fs::read(&directory_path).map_err(|e| Error::io("read", &directory_path, e))?;
+        if format!("{:016x}", xxh3_64(&bytes)) != manifest.directory_hash {
+            return Err(Error::corrupt(&directory_path, 0, "checksum does not match")
+                .hint("build the brick map again"));
+        }
+        let directory: Vec<u64> = bytes
+            .chunks_exact(8)
+            .map(|entry| u64::from_le_bytes(entry.try_into().expect("8 bytes")))
+            .collect();
+        let mut map = Self { path: path.to_path_buf(), manifest, directory, segments: Vec::new() };
+        map.open_segments()?;
+        Ok(map)
+    }
+
+    /// Opens the segments and checks that bricks lie in them in order.
+    fn open_segments(&mut self) -> Result<()> {
+        let mut end = 0;
+        for (brick, &entry) in self.directory.iter().enumerate() {
+            let (offset, length) = place(entry);
+            let straddles = offset / SEGMENT_BYTES != (offset + length - 1) / SEGMENT_BYTES;
+            if offset < end || straddles || offset / SEGMENT_BYTES > end / SEGMENT_BYTES + 1 {
+                return Err(Error::corrupt(
+                    self.path.join("directory"),
+                    8 * brick as u64,
+                    "impossible entry",
+                ));
+            }
+            end = offset + length;
+        }
+        for number in 0..end.div_ceil(SEGMENT_BYTES) {
+            let path = self.path.join(segment_name(number));
+            let file = File::open(&path).map_err(|e| Error::io("open", &path, e))?;
+            let found = file.metadata().map_err(|e| Error::io("read", &path, e))?.len();
+            let last =
+                self.directory.partition_point(|&entry| place(entry).0 < (number + 1) * SEGMENT_BYTES) - 1;
+            let (offset, length) = place(self.directory[last]);
+            let expected = offset + length - number * SEGMENT_BYTES;
+            if found != expected {
+                return Err(Error::corrupt(
+                    &path,
+                    found.min(expected),
+                    format!("{found} bytes, {expected} expected"),
+                )
+                .hint("build the brick map again"));
+            }
+            self.segments.push(file);
+        }
+        Ok(())
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What the manifest says.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// The lattice that all vertices lie on.
+    pub fn lattice(&self) -> Lattice {
+        Lattice {
+            exponent: self.manifest.lattice_exponent,
+            origin: I64Vec3::from_array(self.manifest.lattice_origin),
+        }
+    }
+
+    /// The lattice shift of an occluder stream: its vertices are multiples of `2^shift` steps.
+    pub fn shift(&self, stream: usize) -> u8 {
+        self.manifest.shifts.get(stream).copied().unwrap_or(0)
+    }
+
+    /// Bricks.
+    pub fn brick_count(&self) -> u32 {
+        self.manifest.bricks
+    }
+
+    /// The root brick's number.
+    pub fn root(&self) -> u32 {
+        self.manifest.bricks - 1
+    }
+
+    /// The box of everything on the lattice.
+    pub fn root_box(&self) -> LatticeBox {
+        LatticeBox { min: IVec3::from_array(self.manifest.low), max: IVec3::from_array(self.manifest.high) }
+    }
+
+    /// The box of everything in scene units.
+    pub fn bounds(&self) -> Bounds {
+        let (lattice, all) = (self.lattice(), self.root_box());
+        Bounds { min: lattice.position(all.min), max: lattice.position(all.max) }
+    }
+
+    /// Bytes of all bricks.
+    pub fn bytes(&self) -> u64 {
+        self.manifest.bytes
+    }
+
+    /// Bytes of a brick.
+    pub fn brick_bytes(&self, brick: u32) -> u32 {
+        place(self.directory[brick as usize]).1 as u32
+    }
+
+    /// Reads `count` bricks from `first` on into `out`, one after the other; their lengths add up to its length.
+    ///
+    /// # Errors
+    /// When storage fails.
+    pub fn read(&self, first: u32, count: u32, out: &mut [u8]) -> Result<()> {
+        let mut at = 0;
+        let mut brick = first as usize;
+        let end = first as usize + count as usize;
+        while brick < end {
+            // One read for all that lie in one segment
+            let (offset, _) = place(self.directory[brick]);
+            let segment = offset / SEGMENT_BYTES;
+            let mut bytes = 0;
+            while brick < end && place(self.directory[brick]).0 / SEGMENT_BYTES == segment {
+                bytes += place(self.directory[brick]).1 as usize;
+                brick += 1;
+            }
+            self.segments[segment as usize]
+                .read_exact_at(&mut out[at..at + bytes], offset % SEGMENT_BYTES)
+                .map_err(|e| Error::io("read", self.path.join(segment_name(segment)), e))?;
+            at += bytes;
+        }
+        Ok(())
+    }
+}
+
+/// Offset and length in bytes of a directory entry.
+fn place(entry: u64) -> (u64, u64) {
+    let length = (entry & ((1 << LENGTH_BITS) - 1)) + 1;
+    ((entry >> LENGTH_BITS) * ALIGNMENT as u64, length * ALIGNMENT as u64)
+}
+
+/// Reads and checks a manifest.
+fn read_manifest(path: &Path) -> Result<Manifest> {
+    let found = std::fs::metadata(path).map_err(|e| Error::io("read", path, e))?.len();
+    if found > 1 << 20 {
+        return Err(Error::corrupt(path, 0, "a manifest of over a mebibyte"));
+    }
+    let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+    let text = |e: serde_json::Error| {
+        Error::new(ErrorKind::Corrupt, format!("broken manifest: {e}")).at_text(
+            path,
+            e.line() as u64,
+            e.column() as u64,
+        )
+    };
+    let value: serde_json::Value = serde_json::from_slice(&bytes).map_err(text)?;
+    let version = value.get("version").and_then(serde_json::Value::as_u64);
+    if version != Some(u64::from(FORMAT_VERSION)) {
+        let version = version.map_or("none".into(), |version| version.to_string());
+        return Err(Error::unsupported(format!(
+            "brick map of version {version}, version {FORMAT_VERSION} wanted"
+        ))
+        .at(path)
+        .hint("build the brick map again"));
+    }
+    let manifest: Manifest = serde_json::from_value(value).map_err(text)?;
+    let sane = (-60..=60).contains(&manifest.lattice_exponent)
+        && manifest.lattice_origin.iter().all(|c| c.unsigned_abs() < 1 << 62)
+        && manifest
+            .low
+            .iter()
+            .zip(&manifest.high)
+            .all(|(l, h)| l <= h && l.abs() <= 1 << 30 && h.abs() <= 1 << 30)
+        && manifest.shifts.iter().all(|&shift| shift <= SHIFT_MAX)
+        && manifest.bytes <= u64::from(manifest.bricks) * BYTES_MAX as u64;
+    if !sane {
+        return Err(
+            Error::corrupt(path, 0, "impossible numbers in the manifest").hint("build the brick map again")
+        );
+    }
+    Ok(manifest)
+}

@@ -1,0 +1,282 @@
+//! From a tree to bricks: the tree is cut into treelets of a few kilobytes, each a brick.
+//!
+//! From the leaves up, a node takes its children's treelets into its own until they are too large; then the largest become
+//! bricks of their own. Bricks are numbered and written children first, in the order of the tree: a subtree is one run of
+//! bytes, and the last brick is its root.
+
+use super::bvh::{WideChild, WideTree};
+use super::farfield;
+use crate::brick::node::WIDTH;
+use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble};
+
+/// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
+/// larger ones load what a batch does not touch.
+const TREELET_BYTES: usize = 6 << 10;
+
+/// What a primitive of the tree is.
+#[derive(Clone, Copy, Debug)]
+pub enum Content {
+    /// A leaf, by its place among the encoded leaves.
+    Leaf {
+        /// First byte.
+        offset: u32,
+        /// Bytes.
+        bytes: u32,
+    },
+    /// A brick that is written already.
+    Brick(u32),
+}
+
+/// What a tree is built over: a leaf, or, at the top level, the root brick of a partition.
+#[derive(Clone, Copy, Debug)]
+pub struct Primitive {
+    /// Its box.
+    pub bounds: LatticeBox,
+    /// Area of the faces in squared lattice steps.
+    pub area: f32,
+    /// The same, each face weighted by its opacity.
+    pub opaque_area: f32,
+    /// Micropolygons in it.
+    pub micropolygons: u64,
+    /// What it is.
+    pub content: Content,
+}
+
+/// Bricks, one after the other.
+#[derive(Debug, Default)]
+pub struct Packed {
+    /// Their bytes.
+    pub bytes: Vec<u8>,
+    /// The length of each.
+    pub lengths: Vec<u32>,
+    /// Bytes by what they are for.
+    pub split: ByteSplit,
+}
+
+/// Where a brick map's bytes go.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct ByteSplit {
+    /// Nodes without their far field.
+    pub nodes: u64,
+    /// Far field.
+    pub far_field: u64,
+    /// Leaves.
+    pub leaves: u64,
+    /// Brick headers, tables and padding.
+    pub headers: u64,
+    /// The directory.
+    pub directory: u64,
+}
+
+impl std::ops::AddAssign for ByteSplit {
+    fn add_assign(&mut self, other: Self) {
+        self.nodes += other.nodes;
+        self.far_field += other.far_field;
+        self.leaves += other.leaves;
+        self.headers += other.headers;
+        self.directory += other.directory;
+    }
+}
+
+/// A node of the tree with all that lies below it.
+#[derive(Clone, Copy, Debug)]
+struct Subtree {
+    bounds: LatticeBox,
+    area: f64,
+    opaque_area: f64,
+    micropolygons: u64,
+    /// Bytes and nodes of its treelet, before it becomes a brick.
+    bytes: usize,
+    nodes: usize,
+    /// Whether it is the root of a brick.
+    is_brick: bool,
+}
+
+/// Packs `tree` over `primitives` into bricks numbered from `first_number` on. `leaves` holds the encoded leaves. Returns the
+/// root brick as a primitive of a higher tree.
+pub fn pack(
+    tree: &WideTree,
+    primitives: &[Primitive],
+    leaves: &[u8],
+    first_number: u32,
+    out: &mut Packed,
+) -> Primitive {
+    let mut subtrees = measure(tree, primitives);
+    subtrees[0].is_brick = true;
+    let mut packer = Packer { tree, primitives, leaves, subtrees: &subtrees, first_number, out };
+    let number = packer.brick(0);
+    let root = &subtrees[0];
+    Primitive {
+        bounds: root.bounds,
+        area: root.area as f32,
+        opaque_area: root.opaque_area as f32,
+        micropolygons: root.micropolygons,
+        content: Content::Brick(number),
+    }
+}
+
+/// Sums up every subtree and decides which become bricks.
+fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
+    let empty = Subtree {
+        bounds: LatticeBox::EMPTY,
+        area: 0.0,
+        opaque_area: 0.0,
+        micropolygons: 0,
+        bytes: 0,
+        nodes: 0,
+        is_brick: false,
+    };
+    let mut subtrees = vec![empty; tree.nodes.len()];
+    for (index, node) in tree.nodes.iter().enumerate().rev() {
+        let mut sum = Subtree { bytes: size_of::<Node>(), nodes: 1, ..empty };
+        let mut inner = [0; WIDTH];
+        let mut inner_count = 0;
+        for child in &node.children[..usize::from(node.count)] {
+            match *child {
+                WideChild::Primitive(primitive) => {
+                    let p = &primitives[primitive as usize];
+                    sum.bounds = sum.bounds.union(p.bounds);
+                    sum.area += f64::from(p.area);
+                    sum.opaque_area += f64::from(p.opaque_area);
+                    sum.micropolygons += p.micropolygons;
+                    sum.bytes += match p.content {
+                        Content::Leaf { bytes, .. } => bytes as usize,
+                        Content::Brick(_) => 4,
+                    };
+                }
+                WideChild::Node(child) => {
+                    let below = &subtrees[child as usize];
+                    sum.bounds = sum.bounds.union(below.bounds);
+                    sum.area += below.area;
+                    sum.opaque_area += below.opaque_area;
+                    sum.micropolygons += below.micropolygons;
+                    sum.bytes += below.bytes;
+                    sum.nodes += below.nodes;
+                    inner[inner_count] = child as usize;
+                    inner_count += 1;
+                }
+            }
+        }
+        // The largest children become bricks until the rest fits
+        let inner = &mut inner[..inner_count];
+        inner.sort_by_key(|&child| std::cmp::Reverse(subtrees[child].bytes));
+        for &child in inner.iter() {
+            if sum.bytes <= TREELET_BYTES && sum.nodes <= CHILDREN_MAX / WIDTH {
+                break;
+            }
+            sum.bytes -= subtrees[child].bytes - 4;
+            sum.nodes -= subtrees[child].nodes;
+            subtrees[child].is_brick = true;
+        }
+        subtrees[index] = sum;
+    }
+    subtrees
+}
+
+/// Writes bricks.
+struct Packer<'a> {
+    tree: &'a WideTree,
+    primitives: &'a [Primitive],
+    leaves: &'a [u8],
+    subtrees: &'a [Subtree],
+    first_number: u32,
+    out: &'a mut Packed,
+}
+
+impl Packer<'_> {
+    /// Writes the bricks below `root`, then the brick of its treelet, and returns its number.
+    fn brick(&mut self, root: u32) -> u32 {
+        // The treelet's nodes, parents first
+        let mut members = vec![root];
+        let mut at = 0;
+        while at < members.len() {
+            let node = &self.tree.nodes[members[at] as usize];
+            for child in &node.children[..usize::from(node.count)] {
+                if let WideChild::Node(child) = *child
+                    && !self.subtrees[child as usize].is_brick
+                {
+                    members.push(child);
+                }
+            }
+            at += 1;
+        }
+        let (mut nodes, mut table, mut leaves) = (Vec::with_capacity(members.len()), Vec::new(), Vec::new());
+        let mut micropolygons = 0;
+        let mut next_member = 1_u8;
+        for &member in &members {
+            let wide = self.tree.nodes[member as usize];
+            let children = &wide.children[..usize::from(wide.count)];
+            let mut boxes = [LatticeBox::EMPTY; WIDTH];
+            children.iter().zip(&mut boxes).for_each(|(child, b)| *b = self.bounds(child));
+            let mut node = Node::over(&boxes[..children.len()]);
+            for (slot, child) in children.iter().enumerate() {
+                let (area, opaque_area) = self.areas(child);
+                node.far[slot] = farfield::paper(&node.child_box(slot), area, opaque_area);
+                let reference = match *child {
+                    WideChild::Node(child) if self.subtrees[child as usize].is_brick => {
+                        table.push(self.brick(child));
+                        Child::Brick((table.len() - 1) as u8)
+                    }
+                    WideChild::Node(_) => {
+                        next_member += 1;
+                        Child::Node(next_member - 1)
+                    }
+                    WideChild::Primitive(primitive) => {
+                        let primitive = &self.primitives[primitive as usize];
+                        match primitive.content {
+                            Content::Leaf { offset, bytes } => {
+                                let here = (leaves.len() / 8) as u16;
+                                leaves.extend_from_slice(
+                                    &self.leaves[offset as usize..(offset + bytes) as usize],
+                                );
+                                micropolygons += primitive.micropolygons as u32;
+                                Child::Leaf(here)
+                            }
+                            Content::Brick(number) => {
+                                table.push(number);
+                                Child::Brick((table.len() - 1) as u8)
+                            }
+                        }
+                    }
+                };
+                node.children[slot] = reference.encode();
+            }
+            nodes.push(node);
+        }
+        let number = self.first_number + self.out.lengths.len() as u32;
+        let start = self.out.bytes.len();
+        assemble(number, &mut nodes, &table, &leaves, micropolygons, &mut self.out.bytes);
+        let length = self.out.bytes.len() - start;
+        self.out.lengths.push(length as u32);
+        let far_field = (48 * nodes.len()) as u64;
+        let node_bytes = (80 * nodes.len()) as u64;
+        self.out.split += ByteSplit {
+            nodes: node_bytes,
+            far_field,
+            leaves: leaves.len() as u64,
+            headers: length as u64 - node_bytes - far_field - leaves.len() as u64,
+            directory: 0,
+        };
+        number
+    }
+
+    fn bounds(&self, child: &WideChild) -> LatticeBox {
+        match *child {
+            WideChild::Node(node) => self.subtrees[node as usize].bounds,
+            WideChild::Primitive(primitive) => self.primitives[primitive as usize].bounds,
+        }
+    }
+
+    fn areas(&self, child: &WideChild) -> (f32, f32) {
+        match *child {
+            WideChild::Node(node) => {
+                let subtree = &self.subtrees[node as usize];
+                (subtree.area as f32, subtree.opaque_area as f32)
+            }
+            WideChild::Primitive(primitive) => {
+                let primitive = &self.primitives[primitive as usize];
+                (primitive.area, primitive.opaque_area)
+            }
+        }
+    }
+}
