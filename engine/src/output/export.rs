@@ -105,8 +105,7 @@ fn count(stream: &mut dyn MicrogridStream) -> Result<ExportReport> {
                 _ => report.faces += 1,
             }
         }
-        // A grid of n vertices over a square has edges of about its side / √n.
-        let edge = own.size().max_element() / (grid.vertex_count() as f64).sqrt();
+        let edge = typical_edge(grid);
         if edge > 0.0 {
             edges += edge;
             sized += 1;
@@ -119,6 +118,16 @@ fn count(stream: &mut dyn MicrogridStream) -> Result<ExportReport> {
         report.double_positions = rounding > POSITION_ERROR_MAX * edges / sized as f64;
     }
     Ok(report)
+}
+
+/// The first edge of a grid's first face. Among points, which have none, about the distance of n on a square.
+fn typical_edge(grid: &Microgrid) -> f64 {
+    match grid.faces().next() {
+        Some(&[a, b, ..]) => {
+            grid.positions[usize::from(a)].as_dvec3().distance(grid.positions[usize::from(b)].as_dvec3())
+        }
+        _ => grid.bounds().size().max_element() / (grid.vertex_count() as f64).sqrt(),
+    }
 }
 
 fn header(schema: &Schema, report: &ExportReport) -> String {

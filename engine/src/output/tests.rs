@@ -269,6 +269,14 @@ fn ply_positions_are_doubles_where_they_must_be() {
     let path = folder.path().join("a.ply");
     let mut stream = squares(vec![], 2, |_, _, _, _| 0.0);
     assert!(!export_ply(&mut stream, &path).unwrap().double_positions);
+    // A long strip must be judged by its edges, not by its length.
+    stream.grids.iter_mut().for_each(|grid| {
+        grid.anchor.y = 4_100.7;
+        grid.positions[2].x = 10_000.0;
+        grid.positions[3].x = 10_000.0;
+        grid.positions[1] = Vec3::new(0.0, 0.01, 0.0);
+    });
+    assert!(export_ply(&mut stream, &path).unwrap().double_positions);
     stream.grids.iter_mut().for_each(|grid| grid.anchor.y = 4_100_000.7);
     assert!(export_ply(&mut stream, &path).unwrap().double_positions);
     let (header, body) = split_ply(&path);
