@@ -1,6 +1,6 @@
 //! Microgrid streams: rewindable, strictly sequential sources of microgrids (paper, section 4).
 //!
-//! [`microgrid`] has the unit of data, [`schema`] says which attributes its vertices carry, [`file`] is the `.mgs`
+//! [`microgrid`] has the unit of data, [`schema`] says which attributes its vertices carry, [`mod@file`] is the `.mgs`
 //! format, [`adapt`] turns one stream into another (instances, concatenation, displacement), [`procedural`] makes
 //! streams from nothing.
 

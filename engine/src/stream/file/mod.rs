@@ -12,13 +12,15 @@ mod atomic;
 mod block;
 mod footer;
 mod header;
+mod open_block;
 mod reader;
 mod writer;
 
 pub use atomic::AtomicFile;
 pub use footer::Footer;
 pub use header::{HEADER_BYTES_MAX, METADATA_MAX, VERSION};
-pub use reader::{GridSummary, MgsReader};
+pub use open_block::GridSummary;
+pub use reader::MgsReader;
 pub use writer::MgsWriter;
 
 use super::Microgrid;
@@ -55,7 +57,7 @@ macro_rules! read_le {
         )
     };
 }
-pub(self) use read_le;
+use read_le;
 
 #[cfg(test)]
 mod tests;

@@ -4,18 +4,17 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use glam::{DVec3, Vec3};
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::block::{self, BlockHeader, ValueBytes};
 use super::footer::{self, Footer};
 use super::header::{self, Header};
+use super::open_block::{Block, GridSummary};
 use super::{StreamCounts, read_le};
-use crate::stream::microgrid::FACES_MAX;
 use crate::stream::{Microgrid, MicrogridStream, Schema};
 use crate::{Error, ErrorKind, Result};
 
-/// Reads a `.mgs` file. Memory is bounded by the format's maxima whatever the file claims: about 30 MiB at the very
+/// Reads a `.mgs` file. Memory is bounded by the format's maxima whatever the file claims: under 20 MiB at the very
 /// worst, 4 MiB for what [`MgsWriter`](super::MgsWriter) writes.
 pub struct MgsReader {
     path: PathBuf,
@@ -34,46 +33,11 @@ pub struct MgsReader {
     stored: Vec<u8>,
 }
 
-/// What a counting pass needs to know of a grid.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GridSummary {
-    /// What positions are relative to, in scene units.
-    pub anchor: DVec3,
-    /// The offset of vertex `vertices / 2` from the anchor.
-    pub middle: Vec3,
-    /// Vertices, 1 to 256.
-    pub vertices: u32,
-    /// Faces, at most 1,024.
-    pub faces: u32,
-}
-
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum State {
     Reading,
     Ended,
     Broken,
-}
-
-/// The block that is being read: its decoded columns and how far they are used.
-#[derive(Default)]
-struct Block {
-    offset: u64,
-    grids: usize,
-    vertices: usize,
-    faces: usize,
-    corners: usize,
-    payload_frame: [u32; 2],
-    payload_checksum: u64,
-    payload_offset: u64,
-    has_payload: bool,
-    summary: Vec<u8>,
-    payload: Vec<u8>,
-    positions: Vec<Vec3>,
-    columns: Vec<Vec<u8>>,
-    grid: usize,
-    vertex: usize,
-    face: usize,
-    corner: usize,
 }
 
 impl MgsReader {
@@ -108,7 +72,6 @@ impl MgsReader {
         file.seek(SeekFrom::Start(footer_offset)).map_err(io)?;
         file.read_exact(&mut bytes).map_err(io)?;
         let footer = Footer::decode(&bytes, footer_offset, seed, path)?;
-        let columns = vec![Vec::new(); header.schema.attributes.len()];
         let mut reader = Self {
             path: path.to_path_buf(),
             file,
@@ -121,7 +84,7 @@ impl MgsReader {
             offset: 0,
             counted: Footer::default(),
             state: State::Reading,
-            block: Block { columns, ..Block::default() },
+            block: Block::default(),
             stored: Vec::new(),
         };
         reader.rewind()?;
@@ -152,7 +115,7 @@ impl MgsReader {
     /// # Errors
     /// Like [`next`](MicrogridStream::next).
     pub fn next_summary(&mut self) -> Result<Option<GridSummary>> {
-        let result = self.advance().and_then(|more| more.then(|| self.step_summary()).transpose());
+        let result = self.advance().map(|more| more.then(|| self.block.step_summary()));
         self.note_failure(result)
     }
 
@@ -166,7 +129,7 @@ impl MgsReader {
                     .at_byte(&self.path, self.offset));
             }
         }
-        if self.block.grid < self.block.grids {
+        if !self.block.is_used_up() {
             return Ok(true);
         }
         self.block.check_used_up(&self.path)?;
@@ -235,7 +198,7 @@ impl MgsReader {
         let block = &self.block;
         self.read_frame(block.payload_offset, block.payload_frame, block.payload_checksum, &mut payload)?;
         self.block.payload = payload;
-        self.block.decode_payload(&self.header.schema, &self.path)
+        self.block.open_payload(&self.header.schema, &self.path)
     }
 
     fn read_at(&mut self, offset: u64, bytes: &mut [u8]) -> Result<()> {
@@ -263,19 +226,6 @@ impl MgsReader {
         }
         self.stored = stored;
         Ok(())
-    }
-
-    fn step_summary(&mut self) -> Result<GridSummary> {
-        let block = &mut self.block;
-        let summary = block.summary_of(block.grid);
-        block.grid += 1;
-        block.vertex += summary.vertices as usize;
-        let faces = block.face..block.face + summary.faces as usize;
-        block.face = faces.end;
-        if block.has_payload {
-            block.corner += block.payload[faces].iter().map(|&arity| usize::from(arity)).sum::<usize>();
-        }
-        Ok(summary)
     }
 
     fn step(&mut self, grid: &mut Microgrid) -> Result<()> {
@@ -314,149 +264,5 @@ impl MicrogridStream for MgsReader {
         let read = self.block.offset as f64
             + block_share * (self.offset.max(self.block.offset) - self.block.offset) as f64;
         (read / self.file_bytes as f64).min(1.0)
-    }
-}
-
-impl Block {
-    fn forget(&mut self) {
-        (self.grids, self.vertices, self.faces, self.corners) = (0, 0, 0, 0);
-        (self.grid, self.vertex, self.face, self.corner) = (0, 0, 0, 0);
-        (self.offset, self.has_payload) = (0, false);
-    }
-
-    fn begin(&mut self, offset: u64, header: &BlockHeader, summary: Vec<u8>) {
-        self.forget();
-        self.offset = offset;
-        self.grids = header.grids as usize;
-        self.vertices = header.vertices as usize;
-        self.faces = header.faces as usize;
-        self.corners = header.corners as usize;
-        self.payload_frame = header.payload_bytes;
-        self.payload_checksum = header.payload_checksum;
-        self.payload_offset = offset + block::HEADER_BYTES as u64 + u64::from(header.summary_bytes[1]);
-        self.summary = summary;
-    }
-
-    fn summary_of(&self, grid: usize) -> GridSummary {
-        let [middles, vertex_counts, face_counts] = block::summary_columns(self.grids);
-        let anchor = std::array::from_fn(|i| read_le!(f64, self.summary, 24 * grid + 8 * i));
-        let middle = std::array::from_fn(|i| read_le!(f32, self.summary, middles + 12 * grid + 4 * i));
-        GridSummary {
-            anchor: DVec3::from_array(anchor),
-            middle: Vec3::from_array(middle),
-            vertices: u32::from(self.summary[vertex_counts + grid]) + 1,
-            faces: u32::from(read_le!(u16, self.summary, face_counts + 2 * grid)),
-        }
-    }
-
-    /// Checks what later slicing relies on: the grids' counts add up to the block's.
-    fn check_summary(&self, path: &Path) -> Result<()> {
-        let (mut vertices, mut faces) = (0, 0);
-        for grid in 0..self.grids {
-            let summary = self.summary_of(grid);
-            vertices += summary.vertices as usize;
-            faces += summary.faces as usize;
-            if summary.faces as usize > FACES_MAX {
-                return Err(self.broken(
-                    path,
-                    grid,
-                    &format!("has {} faces, at most {FACES_MAX} are possible", summary.faces),
-                ));
-            }
-            if !summary.anchor.is_finite() || !summary.middle.is_finite() {
-                return Err(self.broken(path, grid, "has a position that is not a finite number"));
-            }
-        }
-        if vertices != self.vertices || faces != self.faces {
-            return Err(Error::corrupt(path, self.offset, "the counts of a block's grids do not add up"));
-        }
-        Ok(())
-    }
-
-    /// Turns planes into columns and checks arities and positions of the whole block at once, which vectorises.
-    fn decode_payload(&mut self, schema: &Schema, path: &Path) -> Result<()> {
-        let arities = &self.payload[..self.faces];
-        let legal = arities.iter().fold(true, |legal, arity| legal & (1..=4).contains(arity));
-        let corners: usize = arities.iter().map(|&arity| usize::from(arity)).sum();
-        if !legal || corners != self.corners {
-            return Err(Error::corrupt(path, self.payload_offset, "a block's faces do not add up"));
-        }
-        let mut rest = &self.payload[self.faces + self.corners..];
-        let positions;
-        (positions, rest) = rest.split_at(12 * self.vertices);
-        self.positions.resize(self.vertices, Vec3::ZERO);
-        block::from_planes(positions, 4, bytemuck::cast_slice_mut(&mut self.positions));
-        let finite = bytemuck::cast_slice::<Vec3, f32>(&self.positions)
-            .iter()
-            .fold(true, |finite, x| finite & (x.to_bits() & 0x7f80_0000 != 0x7f80_0000));
-        for (attribute, column) in schema.attributes.iter().zip(&mut self.columns) {
-            let values =
-                if attribute.rate == crate::stream::Rate::Vertex { self.vertices } else { self.grids };
-            let planes;
-            (planes, rest) = rest.split_at(values * attribute.value_bytes());
-            column.resize(planes.len(), 0);
-            block::from_planes(planes, attribute.value_type.bytes(), column);
-        }
-        if !finite {
-            return Err(Error::corrupt(path, self.payload_offset, "a position is not a finite number"));
-        }
-        self.corner = self.payload[..self.face].iter().map(|&arity| usize::from(arity)).sum();
-        self.has_payload = true;
-        Ok(())
-    }
-
-    /// Copies the next grid out of the columns and checks its indices.
-    fn read_grid(&mut self, schema: &Schema, grid: &mut Microgrid, path: &Path) -> Result<()> {
-        let summary = self.summary_of(self.grid);
-        let (vertices, faces) = (summary.vertices as usize, summary.faces as usize);
-        let arities = &self.payload[self.face..self.face + faces];
-        let corners: usize = arities.iter().map(|&arity| usize::from(arity)).sum();
-        let indices = &self.payload[self.faces + self.corner..][..corners];
-        let positions = &self.positions[self.vertex..self.vertex + vertices];
-        let highest = indices.iter().fold(0, |highest, &index| index.max(highest));
-        if usize::from(highest) >= vertices {
-            let what = format!("has {vertices} vertices and a face index {highest}");
-            return Err(self.broken(path, self.grid, &what));
-        }
-        if positions[vertices / 2] != summary.middle {
-            return Err(self.broken(
-                path,
-                self.grid,
-                "has a middle vertex that is not the one of its summary",
-            ));
-        }
-        grid.clear(schema.attributes.len());
-        grid.anchor = summary.anchor;
-        grid.positions.extend_from_slice(positions);
-        grid.arities.extend_from_slice(arities);
-        grid.indices.extend_from_slice(indices);
-        for ((attribute, values), column) in
-            schema.attributes.iter().zip(&self.columns).zip(&mut grid.columns)
-        {
-            let bytes = attribute.value_bytes();
-            let range = match attribute.rate {
-                crate::stream::Rate::Vertex => self.vertex * bytes..(self.vertex + vertices) * bytes,
-                crate::stream::Rate::Grid => self.grid * bytes..(self.grid + 1) * bytes,
-            };
-            column.extend_from_slice(&values[range]);
-        }
-        self.grid += 1;
-        self.vertex += vertices;
-        self.face += faces;
-        self.corner += corners;
-        Ok(())
-    }
-
-    /// After its last grid a block must be used up, or its counts lied.
-    fn check_used_up(&self, path: &Path) -> Result<()> {
-        let used = self.vertex == self.vertices && self.face == self.faces;
-        if !used || (self.has_payload && self.corner != self.corners) {
-            return Err(Error::corrupt(path, self.offset, "the counts of a block's grids do not add up"));
-        }
-        Ok(())
-    }
-
-    fn broken(&self, path: &Path, grid: usize, what: &str) -> Error {
-        Error::corrupt(path, self.payload_offset, format!("grid {grid} of a block {what}"))
     }
 }
