@@ -8,9 +8,9 @@ use crate::error::nearest;
 use crate::{ErrorKind, Result};
 
 /// Types of files that a stream can come from.
-const STREAM_TYPES: [&str; 5] = ["mgs", "ply", "obj", "gltf", "glb"];
+pub(super) const STREAM_TYPES: [&str; 5] = ["mgs", "ply", "obj", "gltf", "glb"];
 /// Types that the grammar declares and this version cannot read.
-const STREAM_TYPES_LATER: [&str; 4] = ["usd", "usda", "usdc", "usdz"];
+pub(super) const STREAM_TYPES_LATER: [&str; 4] = ["usd", "usda", "usdc", "usdz"];
 /// Digits of a frame number at most, in a pattern.
 const FRAME_DIGITS_MAX: usize = 9;
 /// Entries of a folder to look at, at most, for a name like the one that is missing.

@@ -24,7 +24,8 @@ const OCCLUDER_NAMES_MAX: usize = 1_000_000;
 const MICROPOLYGONS_MAX: u64 = 1_000_000_000_000;
 
 /// The filters the grammar declares (paper, section 4.2).
-const FILTERS: [&str; 5] = ["backface", "frustum", "occlusion", "camera_decimation", "feature_decimation"];
+pub(super) const FILTERS: [&str; 5] =
+    ["backface", "frustum", "occlusion", "camera_decimation", "feature_decimation"];
 
 /// Reads geometries once cameras, shaders and the geometries' own names are known.
 pub(super) struct Geometries<'a, 'd> {

@@ -6,7 +6,7 @@ use super::{Domain, ErrorKind, Result, ShOcclusion, Shader, ShaderKind, Weight};
 use crate::stream::ValueType;
 
 /// The types of shaders, and whether this version has them.
-const TYPES: [(&str, bool); 6] = [
+pub(super) const TYPES: [(&str, bool); 6] = [
     ("sh_occlusion", true),
     ("irradiance", false),
     ("area_light", false),
@@ -16,7 +16,8 @@ const TYPES: [(&str, bool); 6] = [
 ];
 
 /// The parameters of `sh_occlusion`.
-const SH_OCCLUSION: [&str; 7] = ["bands", "samples", "domain", "weight", "maxdistance", "storage", "error"];
+pub(super) const SH_OCCLUSION: [&str; 7] =
+    ["bands", "samples", "domain", "weight", "maxdistance", "storage", "error"];
 
 /// `<shader name="" type=""> <param name="" value=""/>... </shader>`
 pub(super) fn shader<'d>(element: Element<'d>, names: &mut Names<'d>) -> Result<Shader> {
