@@ -254,7 +254,7 @@ fn expected(message: String, names: &[&str]) -> String {
 /// Adds the nearest of the valid names as hint, if one is near.
 fn did_you_mean(error: Error, name: &str, names: &[&str]) -> Error {
     match nearest(name, names.iter().copied()) {
-        Some(near) => error.hint(format!("did you mean `{near}`?")),
-        None => error,
+        Some(near) if !name.is_empty() => error.hint(format!("did you mean `{near}`?")),
+        _ => error,
     }
 }

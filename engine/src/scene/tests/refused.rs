@@ -103,7 +103,7 @@ fn bad_values_are_refused() {
     check_invalid(
         r#"
 units="cm" | units="«xm" | unknown unit `xm`, expected one of `m`, `cm`, `mm`, `km`, `in`, `ft`, `yd` | did you mean `m`?
-units="cm" | units="«" | unknown unit `` | did you mean `m`?
+units="cm" | units="«" | unknown unit `` |
 up="z" | up="«Z" | unknown up axis `Z`, expected one of `y`, `z` | did you mean `z`?
 fov="40" | fov="«180" | `180` is out of range, expected degrees more than 0 and less than 180 |
 fov="40" | fov="«nan" | `nan` is not a finite number, expected degrees |
