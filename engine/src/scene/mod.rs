@@ -1,12 +1,89 @@
 //! The scene: what to bake, as an XML file declares it (paper, section 4; `docs/scene.md`).
+//!
+//! Text becomes a tree that knows its places (`xml`), the tree becomes typed values (`element`, `parse`, `shader`,
+//! `geometry`), names are resolved on the way (`names`), and files and transforms are checked (`files`, `matrix`).
+//! Instance files may be large: [`instances`] streams them.
 
-use std::path::PathBuf;
+mod element;
+mod files;
+mod geometry;
+pub mod instances;
+mod matrix;
+mod names;
+mod parse;
+mod shader;
+#[cfg(test)]
+mod tests;
+mod xml;
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use glam::DMat4;
 
+pub use self::instances::{InstanceReader, for_each_instance};
+pub use self::xml::{DEPTH_MAX, ELEMENTS_MAX, SCENE_BYTES_MAX, VALUE_BYTES_MAX};
 pub use crate::stream::schema::UpAxis;
+use crate::{Error, ErrorKind, Result};
 
-/// A validated scene. Everything refers to everything by name; names are unique over the scene.
+/// Reads and checks a scene file whose paths have no frame patterns.
+///
+/// # Errors
+/// As [`load_frame`].
+pub fn load(path: &Path) -> Result<Scene> {
+    load_frame(path, None)
+}
+
+/// Reads and checks a scene file; `frame` fills patterns such as `####` and `%04d` in its paths.
+///
+/// What instance files hold is checked when [`for_each_instance`] reads them.
+///
+/// # Errors
+/// [`ErrorKind::NotFound`] and [`ErrorKind::Io`] for the file itself, and those of [`parse_frame`].
+pub fn load_frame(path: &Path, frame: Option<i64>) -> Result<Scene> {
+    let file = File::open(path).map_err(|source| Error::io("open scene", path, source))?;
+    let mut bytes = Vec::new();
+    // One byte more than allowed tells a file that is too long, however long it claims to be
+    let read = file.take(SCENE_BYTES_MAX as u64 + 1).read_to_end(&mut bytes);
+    read.map_err(|source| Error::io("read scene", path, source))?;
+    if bytes.len() > SCENE_BYTES_MAX {
+        return Err(xml::too_long(bytes.len() as u64).at(path));
+    }
+    let text = std::str::from_utf8(&bytes).map_err(|error| not_utf8(path, &bytes, error))?;
+    parse_frame(path, text, frame)
+}
+
+/// Checks the text of a scene whose paths have no frame patterns.
+///
+/// # Errors
+/// As [`parse_frame`].
+pub fn parse(path: &Path, text: &str) -> Result<Scene> {
+    parse_frame(path, text, None)
+}
+
+/// Checks the text of a scene. `path` names it in errors and is the base of the paths in it.
+///
+/// # Errors
+/// With line and column, what was expected and the nearest valid name: [`ErrorKind::Invalid`] for whatever is wrong
+/// with the text, [`ErrorKind::NotFound`] for a file that is not there, [`ErrorKind::Unsupported`] for what the
+/// grammar declares and this version cannot do yet, [`ErrorKind::Limit`] beyond a stated limit.
+pub fn parse_frame(path: &Path, text: &str, frame: Option<i64>) -> Result<Scene> {
+    parse::scene(&xml::Document::parse(path, text)?, frame)
+}
+
+fn not_utf8(path: &Path, bytes: &[u8], error: std::str::Utf8Error) -> Error {
+    let before = String::from_utf8_lossy(&bytes[..error.valid_up_to()]);
+    let (line, column) = xml::place_in(before.trim_start_matches('\u{feff}'));
+    let error = Error::invalid("text is not UTF-8").at_text(path, line, column);
+    match bytes {
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => error.hint("it looks like UTF-16: save the file as UTF-8"),
+        _ => error.hint("save the file as UTF-8"),
+    }
+}
+
+/// A validated scene. Everything refers to everything by name; names are unique over the scene within their kind
+/// (camera, shader, geometry, bake set).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
     /// The file it was read from.
