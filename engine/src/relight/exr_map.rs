@@ -78,3 +78,97 @@ fn broken(path: &Path, error: exr::error::Error) -> Error {
             .hint("an environment needs a flat layer with channels R, G and B"),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use exr::prelude::{Encoding, Image, SpecificChannels, WritableImage};
+
+    use super::*;
+
+    /// An EXR of 40 × 20 pixels, one of them broken, in rows or tiles.
+    fn encoded(encoding: Encoding) -> Vec<u8> {
+        let pixel = |at: Vec2<usize>| match (at.x(), at.y()) {
+            (3, 4) => (f32::NAN, -1.0, f32::INFINITY),
+            (x, y) => (x as f32, y as f32, 0.25),
+        };
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        Image::from_encoded_channels((40, 20), encoding, SpecificChannels::rgb(pixel))
+            .write()
+            .non_parallel()
+            .to_buffered(&mut bytes)
+            .expect("encoded");
+        bytes.into_inner()
+    }
+
+    fn read_bytes(bytes: &[u8]) -> Result<(LatLong, u64)> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("map.exr");
+        std::fs::write(&path, bytes).expect("written");
+        read(&path)
+    }
+
+    /// Catches transposed or swapped pixels, in rows and in tiles, and broken pixels that get through.
+    #[test]
+    fn rows_and_tiles_are_read() {
+        for encoding in [Encoding::UNCOMPRESSED, Encoding::SMALL_LOSSLESS, Encoding::FAST_LOSSLESS] {
+            let (map, repaired) = read_bytes(&encoded(encoding)).expect("read");
+            assert_eq!((map.size(), repaired), ([40, 20], 1));
+            for (at, (_, _, rgb)) in map.samples().enumerate() {
+                let (x, y) = (at % 40, at / 40);
+                let expected =
+                    if (x, y) == (3, 4) { [0.0, 0.0, 65_504.0] } else { [x as f32, y as f32, 0.25] };
+                let close = rgb.iter().zip(expected).all(|(a, b)| (a - b).abs() <= 1e-5 * b);
+                assert!(close, "{x} {y}: {rgb:?}");
+            }
+        }
+    }
+
+    /// Catches a truncated file that is taken for whole, or a panic, at every length.
+    #[test]
+    fn every_truncation_is_an_error() {
+        let whole = encoded(Encoding::SMALL_LOSSLESS);
+        for length in 0..whole.len() {
+            let error = read_bytes(&whole[..length]).expect_err("truncated");
+            assert_eq!(error.kind(), ErrorKind::Corrupt, "{length} bytes: {error}");
+        }
+    }
+
+    /// Catches a panic, a hang or a huge allocation on any flipped bit.
+    #[test]
+    fn flipped_bits_never_panic() {
+        for encoding in [Encoding::UNCOMPRESSED, Encoding::SMALL_LOSSLESS, Encoding::FAST_LOSSLESS] {
+            let whole = encoded(encoding);
+            let mut refused = 0;
+            // The head byte by byte, the pixels at every seventh bit.
+            for bit in (0..whole.len() * 8).filter(|bit| *bit < 8_000 || bit % 7 == 0) {
+                let mut bytes = whole.clone();
+                bytes[bit / 8] ^= 1 << (bit % 8);
+                match read_bytes(&bytes) {
+                    Ok((map, _)) => {
+                        assert!(
+                            map.samples().all(|(_, _, rgb)| rgb.iter().all(|v| v.is_finite() && *v >= 0.0))
+                        );
+                    }
+                    Err(_) => refused += 1,
+                }
+            }
+            assert!(refused > 100, "{refused}");
+        }
+    }
+
+    /// Catches dimensions that dictate memory: the data window is rewritten to cover 2^31 pixels, or too many rows.
+    #[test]
+    fn huge_dimensions_are_refused() {
+        let whole = encoded(Encoding::UNCOMPRESSED);
+        let window = b"dataWindow\0box2i\0\x10\0\0\0";
+        let at = whole.windows(window.len()).position(|bytes| bytes == window).expect("a data window")
+            + window.len();
+        for (x, y) in [(i32::MAX - 1, i32::MAX - 1), (i32::MAX - 1, 19), (39, 8_192), (16_384, 19)] {
+            let mut bytes = whole.clone();
+            bytes[at + 8..at + 12].copy_from_slice(&x.to_le_bytes());
+            bytes[at + 12..at + 16].copy_from_slice(&y.to_le_bytes());
+            let error = read_bytes(&bytes).expect_err("refused");
+            assert!(matches!(error.kind(), ErrorKind::Limit | ErrorKind::Corrupt), "{x} {y}: {error}");
+        }
+    }
+}

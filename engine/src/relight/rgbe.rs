@@ -244,3 +244,123 @@ pub(super) fn check_dimensions(path: &Path, width: usize, height: usize) -> Resu
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Rgb;
+    use image::codecs::hdr::HdrEncoder;
+
+    /// The picture that tests write: smooth enough for run-length coding, different in every pixel.
+    fn pixels(width: usize, height: usize) -> Vec<Rgb<f32>> {
+        let value = |at: usize| [(at / width) as f32 + 0.5, (at % width / 4) as f32, 100.0 * (at + 1) as f32];
+        (0..width * height).map(|at| Rgb(value(at))).collect()
+    }
+
+    fn read_bytes(bytes: &[u8]) -> Result<(LatLong, u64)> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("map.hdr");
+        std::fs::write(&path, bytes).expect("written");
+        read(&path)
+    }
+
+    fn encoded(width: usize, height: usize) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        HdrEncoder::new(&mut bytes).encode(&pixels(width, height), width, height).expect("encoded");
+        bytes
+    }
+
+    fn rows(map: &LatLong) -> Vec<[f32; 3]> {
+        map.samples().map(|(_, _, rgb)| rgb).collect()
+    }
+
+    /// Catches a wrong exponent, component order or run length: another encoder's file must come back to 1 in 128.
+    #[test]
+    fn files_of_another_encoder_are_read() {
+        // Rows of fewer than 8 pixels are not run-length coded.
+        for (width, height) in [(40, 6), (5, 3)] {
+            let (map, repaired) = read_bytes(&encoded(width, height)).expect("read");
+            assert_eq!((map.size(), repaired), ([width, height], 0));
+            for (found, Rgb(wanted)) in rows(&map).iter().zip(pixels(width, height)) {
+                let largest = wanted.iter().copied().fold(0.0, f32::max);
+                let close = found.iter().zip(wanted).all(|(a, b)| (a - b).abs() <= largest / 128.0);
+                assert!(close, "{found:?}, {wanted:?} expected");
+            }
+        }
+    }
+
+    /// Catches a reader that ignores the EXPOSURE, the order of rows and columns, or the old run-length code.
+    #[test]
+    fn orientations_exposures_and_old_runs_are_read() {
+        let file = |dimensions: &str| {
+            let mut bytes = b"#?RGBE\nEXPOSURE=2\nFORMAT=32-bit_rle_rgbe\n\n".to_vec();
+            bytes.extend_from_slice(dimensions.as_bytes());
+            // Exponent 136: mantissas are the values. The first pixel thrice, then two others.
+            bytes.extend_from_slice(
+                &[[2, 4, 6, 136], [1, 1, 1, 2], [8, 8, 8, 136], [10, 10, 10, 136]].concat(),
+            );
+            bytes
+        };
+        let reds = |dimensions: &str| -> Vec<f32> {
+            let (map, _) = read_bytes(&file(dimensions)).expect("read");
+            rows(&map).iter().map(|rgb| rgb[0]).collect()
+        };
+        assert_eq!(reds("-Y 1 +X 5\n"), [1.0, 1.0, 1.0, 4.0, 5.0]);
+        assert_eq!(reds("-Y 1 -X 5\n"), [5.0, 4.0, 1.0, 1.0, 1.0]);
+        assert_eq!(reds("+X 1 +Y 5\n"), [5.0, 4.0, 1.0, 1.0, 1.0]);
+        assert_eq!(reds("+X 1 -Y 5\n"), [1.0, 1.0, 1.0, 4.0, 5.0]);
+    }
+
+    /// Catches a truncated file that is taken for whole, or a panic, at every length.
+    #[test]
+    fn every_truncation_is_an_error() {
+        let whole = encoded(20, 4);
+        for length in 0..whole.len() {
+            let error = read_bytes(&whole[..length]).expect_err("truncated");
+            assert_eq!(error.kind(), ErrorKind::Corrupt, "{length} bytes: {error}");
+            assert!(error.place().is_some(), "{error}");
+        }
+    }
+
+    /// Catches a panic or a hang on any flipped bit. Some flips only change a pixel; none may give a broken one.
+    #[test]
+    fn flipped_bits_never_panic() {
+        let whole = encoded(20, 4);
+        let mut refused = 0;
+        for bit in 0..whole.len() * 8 {
+            let mut bytes = whole.clone();
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            match read_bytes(&bytes) {
+                Ok((map, _)) => assert!(rows(&map).iter().flatten().all(|v| v.is_finite() && *v >= 0.0)),
+                Err(_) => refused += 1,
+            }
+        }
+        assert!(refused > 100, "{refused}");
+    }
+
+    /// Catches memory that a header dictates, and headers without end.
+    #[test]
+    fn hostile_headers_are_refused() {
+        let head = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n";
+        for (rest, kind) in [
+            ("\n-Y 4000000000 +X 4000000000\n", ErrorKind::Limit),
+            ("\n-Y 99999999999999999999999 +X 1\n", ErrorKind::Corrupt),
+            ("\n-Y 8193 +X 16\n", ErrorKind::Limit),
+            ("\n-Y 0 +X 16\n", ErrorKind::Corrupt),
+            ("\n-Y 16 +Y 16\n", ErrorKind::Corrupt),
+            ("\n-Y 16\n", ErrorKind::Corrupt),
+            ("EXPOSURE=0\n\n-Y 1 +X 1\n", ErrorKind::Corrupt),
+            ("EXPOSURE=1e30\nEXPOSURE=1e30\n\n-Y 1 +X 1\n", ErrorKind::Corrupt),
+            ("FORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n", ErrorKind::Unsupported),
+            (&"a".repeat(10_000), ErrorKind::Corrupt),
+            (&"a\n".repeat(1_000), ErrorKind::Corrupt),
+        ] {
+            let error = read_bytes(format!("{head}{rest}").as_bytes()).expect_err("refused");
+            assert_eq!(error.kind(), kind, "{}: {error}", &rest[..rest.len().min(40)]);
+        }
+        assert_eq!(read_bytes(b"P6 1 1 255 abc\n").expect_err("no HDR").kind(), ErrorKind::Corrupt);
+        // 64 bytes that promise the largest picture there is end at once.
+        let lie = format!("{head}\n-Y 8192 +X 16384\n");
+        assert_eq!(read_bytes(lie.as_bytes()).expect_err("empty").kind(), ErrorKind::Corrupt);
+    }
+}
