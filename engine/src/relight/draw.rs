@@ -19,6 +19,9 @@ const GRIDS_PER_BATCH: usize = 256;
 /// Reflectance of streams that carry none (design, section 8).
 pub const ALBEDO_DEFAULT: f32 = 0.5;
 
+/// Radiance beyond this comes from broken coefficients, and sums of it would overflow.
+const RADIANCE_MAX: f32 = 1e30;
+
 /// Points are drawn at least this wide, so that a cloud of them is a surface: pixels of radius.
 const POINT_RADIUS_MIN_PIXELS: f32 = 1.0;
 
@@ -237,8 +240,8 @@ impl Slot {
             let white = shading.transfer.radiance(normal, &visibility);
             vertex.rgb = std::array::from_fn(|i| {
                 let value = white[i] * albedo[i];
-                // False for NaN as well.
-                if value > 0.0 { value.min(f32::MAX) } else { 0.0 }
+                // Negative values are the basis ringing; what is not finite would spread to whole pixels.
+                if value > 0.0 && value < RADIANCE_MAX { value } else { 0.0 }
             });
         }
     }

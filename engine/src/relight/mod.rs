@@ -22,6 +22,9 @@ pub use picture::Picture;
 pub use sky::{Sky, SunPosition};
 pub use visible::{VisibleGrids, visible_grids};
 
+#[cfg(test)]
+mod tests;
+
 use draw::{Columns, Shading};
 use raster::Sample;
 use view::View;
