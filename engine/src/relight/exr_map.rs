@@ -1,7 +1,7 @@
 //! OpenEXR pictures as environments, read block by block so that memory stays bounded.
 
 use std::fs::File;
-use std::io::{BufReader, Seek};
+use std::io::{BufReader, Read, Seek};
 use std::path::Path;
 
 use exr::meta::MetaData;
@@ -21,7 +21,11 @@ const BLOCK_BYTES_MAX: usize = 256 << 20;
 /// When the file is unreadable, truncated or broken, has no such layer, or is larger than 16,384 × 8,192 pixels.
 pub fn read(path: &Path) -> Result<(LatLong, u64)> {
     let file = File::open(path).map_err(|error| Error::io("open", path, error))?;
-    let mut reader = BufReader::new(file);
+    decode(path, BufReader::new(file))
+}
+
+/// Reads from `reader`; `path` is for errors.
+fn decode(path: &Path, mut reader: impl Read + Seek) -> Result<(LatLong, u64)> {
     check(path, &MetaData::read_from_buffered(&mut reader, false).map_err(|error| broken(path, error))?)?;
     reader.rewind().map_err(|error| Error::io("read", path, error))?;
     let image = exr::prelude::read()
@@ -101,10 +105,7 @@ mod tests {
     }
 
     fn read_bytes(bytes: &[u8]) -> Result<(LatLong, u64)> {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("map.exr");
-        std::fs::write(&path, bytes).expect("written");
-        read(&path)
+        decode(Path::new("map.exr"), std::io::Cursor::new(bytes))
     }
 
     /// Catches transposed or swapped pixels, in rows and in tiles, and broken pixels that get through.

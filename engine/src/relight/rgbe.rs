@@ -22,7 +22,12 @@ const LINES_MAX: usize = 256;
 /// When the file is unreadable, truncated or broken, is in XYZ colour, or is larger than 16,384 × 8,192 pixels.
 pub fn read(path: &Path) -> Result<(LatLong, u64)> {
     let file = File::open(path).map_err(|error| Error::io("open", path, error))?;
-    let mut reader = Reader { path, bytes: BufReader::with_capacity(1 << 16, file), offset: 0 };
+    decode(path, BufReader::with_capacity(1 << 16, file))
+}
+
+/// Reads from `bytes`, which should be buffered; `path` is for errors.
+fn decode(path: &Path, bytes: impl Read) -> Result<(LatLong, u64)> {
+    let mut reader = Reader { path, bytes, offset: 0 };
     let header = reader.header()?;
     let mut builder = LatLongBuilder::new(header.width, header.height);
     let (length, count) =
@@ -60,13 +65,13 @@ fn to_rgb([r, g, b, exponent]: [u8; 4]) -> [f32; 3] {
     [r, g, b].map(|value| f32::from(value) * scale)
 }
 
-struct Reader<'a> {
+struct Reader<'a, R> {
     path: &'a Path,
-    bytes: BufReader<File>,
+    bytes: R,
     offset: u64,
 }
 
-impl Reader<'_> {
+impl<R: Read> Reader<'_, R> {
     fn corrupt(&self, message: impl Into<String>) -> Error {
         Error::corrupt(self.path, self.offset, message)
     }
@@ -258,10 +263,7 @@ mod tests {
     }
 
     fn read_bytes(bytes: &[u8]) -> Result<(LatLong, u64)> {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("map.hdr");
-        std::fs::write(&path, bytes).expect("written");
-        read(&path)
+        decode(Path::new("map.hdr"), bytes)
     }
 
     fn encoded(width: usize, height: usize) -> Vec<u8> {
