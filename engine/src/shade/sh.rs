@@ -6,6 +6,12 @@
 
 use glam::{DVec3, Vec3};
 
+mod quadrature;
+mod triple;
+
+pub use quadrature::gauss_legendre;
+pub use triple::TripleProduct;
+
 /// Bands at most.
 pub const BANDS_MAX: usize = 6;
 
@@ -134,6 +140,56 @@ evaluation! {
     evaluate_f64, f64, DVec3
 }
 
+/// The clamped cosine max(0, n·ω) in spherical harmonics: it is zonal about its normal n.
+pub struct ZonalCosine;
+
+impl ZonalCosine {
+    /// A_l: coefficient (l, m) of the clamped cosine about n is A_l Y_lm(n).
+    ///
+    /// A_l = 2π ∫₀¹ t P_l(t) dt (Ramamoorthi and Hanrahan 2001, equation 8, with their √(4π/(2l+1)) multiplied in).
+    pub const BANDS: [f64; BANDS_MAX] = {
+        use std::f64::consts::PI;
+        [PI, 2.0 * PI / 3.0, PI / 4.0, 0.0, -PI / 24.0, 0.0]
+    };
+
+    /// Writes the `bands`² coefficients of the clamped cosine about the unit vector `normal` to the head of `out`.
+    ///
+    /// # Panics
+    /// When `bands` is not 1 to 6 or `out` is shorter than `bands`².
+    pub fn evaluate(bands: usize, normal: Vec3, out: &mut [f32]) {
+        evaluate(bands, normal, out);
+        for l in 0..bands {
+            for value in &mut out[l * l..(l + 1) * (l + 1)] {
+                *value *= Self::BANDS[l] as f32;
+            }
+        }
+    }
+}
+
+/// Projects radiance to `bands` bands: per colour Σ L(ω) Y_lm(ω) Δω over `samples` of (direction, solid angle in
+/// steradian, linear RGB). Coefficients past `bands`² are zero.
+///
+/// # Panics
+/// When `bands` is not 1 to 6.
+pub fn project(
+    bands: usize,
+    samples: impl IntoIterator<Item = (DVec3, f64, [f32; 3])>,
+) -> [[f64; COEFFICIENTS_MAX]; 3] {
+    let mut light = [[0.0; COEFFICIENTS_MAX]; 3];
+    let mut basis = [0.0; COEFFICIENTS_MAX];
+    let count = coefficient_count(bands);
+    for (direction, solid_angle, rgb) in samples {
+        evaluate_f64(bands, direction, &mut basis);
+        for (coefficients, value) in light.iter_mut().zip(rgb) {
+            let weight = f64::from(value) * solid_angle;
+            for (sum, y) in coefficients[..count].iter_mut().zip(&basis) {
+                *sum += weight * y;
+            }
+        }
+    }
+    light
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -238,5 +294,51 @@ mod tests {
             assert_eq!(bands_of(coefficient_count(bands)), Some(bands));
         }
         assert_eq!([bands_of(0), bands_of(8), bands_of(49)], [None; 3]);
+    }
+
+    /// Catches a wrong A_l and a cosine turned the wrong way: the coefficients are compared with a quadrature.
+    #[test]
+    fn the_clamped_cosine_is_its_own_projection() {
+        let normal = DVec3::new(0.48, -0.6, 0.64);
+        // The cosine's edge is turned into the pole's frame, where midpoints in z meet it exactly.
+        let tangent = normal.any_orthonormal_pair();
+        let mut expected = [0.0; COEFFICIENTS_MAX];
+        sphere(|d, weight| {
+            let mut y = [0.0; COEFFICIENTS_MAX];
+            evaluate_f64(BANDS_MAX, tangent.0 * d.x + tangent.1 * d.y + normal * d.z, &mut y);
+            expected.iter_mut().zip(y).for_each(|(sum, y)| *sum += weight * d.z.max(0.0) * y);
+        });
+        let mut cosine = [0.0_f32; COEFFICIENTS_MAX];
+        ZonalCosine::evaluate(BANDS_MAX, normal.as_vec3(), &mut cosine);
+        for i in 0..COEFFICIENTS_MAX {
+            assert!((f64::from(cosine[i]) - expected[i]).abs() < 2e-6, "{i}: {} {}", cosine[i], expected[i]);
+        }
+    }
+
+    /// Catches a projection that forgets the solid angle or mixes colours.
+    #[test]
+    fn projecting_a_band_limited_function_returns_it() {
+        let (nodes, weights) = gauss_legendre(8);
+        let mut samples = Vec::new();
+        for (z, weight) in nodes.iter().zip(&weights) {
+            for column in 0..16 {
+                let phi = std::f64::consts::TAU * f64::from(column) / 16.0;
+                let r = (1.0 - z * z).sqrt();
+                let d = DVec3::new(r * phi.cos(), r * phi.sin(), *z);
+                let mut y = [0.0; 9];
+                evaluate_f64(3, d, &mut y);
+                let rgb = [1.0, (y[1] + 2.0 * y[7]) as f32, (3.0 * y[8]) as f32];
+                samples.push((d, weight * std::f64::consts::TAU / 16.0, rgb));
+            }
+        }
+        let light = project(3, samples);
+        let mut expected = [[0.0; COEFFICIENTS_MAX]; 3];
+        expected[0][0] = (4.0 * std::f64::consts::PI).sqrt();
+        (expected[1][1], expected[1][7], expected[2][8]) = (1.0, 2.0, 3.0);
+        for (color, (found, wanted)) in light.iter().zip(&expected).enumerate() {
+            for i in 0..COEFFICIENTS_MAX {
+                assert!((found[i] - wanted[i]).abs() < 1e-6, "colour {color}, {i}: {}", found[i]);
+            }
+        }
     }
 }
