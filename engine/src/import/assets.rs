@@ -202,3 +202,99 @@ fn far_terrain_keeps_its_decimals() {
     // Half of the step that a grid of up to 4,096 m is rounded to
     assert!(worst <= 0.5_f64.powi(13), "{worst}");
 }
+
+/// Catches leaf cards that turn opaque, vanish, or get the colour of their clear texels.
+#[test]
+fn leaf_cards_let_light_through() {
+    let Some(folder) = folder() else { return };
+    for name in ["trees_eztree/oak_medium.glb", "trees_eztree/pine_medium.glb", "pine_gltf/scene.gltf"] {
+        let (sink, report) = collect(&folder.join(name)).unwrap();
+        let opacities = sink.values(names::OPACITY);
+        // Bark is opaque to the last bit: what is not is leaves, but for those of which a card shows all
+        let leaves: Vec<f32> = opacities.iter().copied().filter(|&opacity| opacity < 1.0).collect();
+        let mean = leaves.iter().sum::<f32>() / leaves.len() as f32;
+        let clear = leaves.iter().filter(|&&opacity| opacity == 0.0).count();
+        let green = green_share(&sink);
+        let faces = report.micropolygons as f64 / report.grids as f64;
+        eprintln!(
+            "{name}: {} of {} vertices on leaves, opacity {mean:.3}, {clear} clear, {green:.2} green, \
+             {} grids of {faces:.0} faces and {:.0} vertices, {:?}",
+            leaves.len(),
+            opacities.len(),
+            report.grids,
+            opacities.len() as f64 / report.grids as f64,
+            report.warnings
+        );
+        assert!(leaves.len() > opacities.len() / 8, "{name}: {} leaves", leaves.len());
+        assert!((0.1..0.9).contains(&mean), "{name}: {mean}");
+        assert!(clear * 4 < leaves.len(), "{name}: {clear} clear");
+    }
+}
+
+/// The share of vertices with opacity below one whose albedo is more green than blue.
+fn green_share(sink: &Collect) -> f64 {
+    let (albedo, opacity) =
+        (sink.schema.find(names::ALBEDO).unwrap(), sink.schema.find(names::OPACITY).unwrap());
+    let (mut leaves, mut green) = (0, 0);
+    for grid in &sink.grids {
+        for vertex in 0..grid.vertex_count() {
+            if grid.unit_value(&sink.schema, opacity, vertex, 0) < 1.0 {
+                let rgb = grid.vec3(&sink.schema, albedo, vertex);
+                leaves += 1;
+                green += u32::from(rgb.y > rgb.z);
+            }
+        }
+    }
+    f64::from(green) / f64::from(leaves)
+}
+
+/// Catches a report that names a validator's error of structure and a file that is read all the same, and any panic.
+#[test]
+fn files_that_a_validator_refuses_never_panic() {
+    let Some(folder) = folder() else { return };
+    let mut files = Vec::new();
+    let mut folders = vec![folder.join("malformed")];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if is_importable(&path) {
+                files.push(path);
+            }
+        }
+    }
+    files.sort();
+    // Read or refused, with errors by the validator or without
+    let mut tally = [[0; 2]; 2];
+    let mut panics = Vec::new();
+    for path in &files {
+        let outcome = std::panic::catch_unwind(|| collect(path).map(|(_, report)| report));
+        let Ok(outcome) = outcome else {
+            panics.push(path.clone());
+            continue;
+        };
+        let oracle = std::fs::read_to_string(format!("{}.report.json", path.display())).ok();
+        let errors = oracle.and_then(|text| serde_json::from_str::<serde_json::Value>(&text).ok());
+        let errors = errors.and_then(|report| report["issues"]["numErrors"].as_u64());
+        if let Some(errors) = errors {
+            tally[usize::from(errors > 0)][usize::from(outcome.is_err())] += 1;
+        }
+        if std::env::var_os("PANTARAY_VERBOSE").is_some() {
+            let name = path.strip_prefix(&folder).unwrap().display().to_string();
+            match outcome {
+                Ok(report) => eprintln!("{errors:?} read    {name} {:?} {:?}", report.skipped, report.warnings),
+                Err(error) => eprintln!("{errors:?} refused {name}: {}", error.message()),
+            }
+        }
+    }
+    eprintln!(
+        "{} malformed files; without errors: {} read, {} refused; with errors: {} read, {} refused",
+        files.len(),
+        tally[0][0],
+        tally[0][1],
+        tally[1][0],
+        tally[1][1]
+    );
+    assert!(files.len() > 300 && panics.is_empty(), "{panics:?}");
+}

@@ -1,6 +1,7 @@
 //! Accessors: typed views of buffers, dense or sparse, as plain arrays.
 
 use super::container::{Container, missing};
+use super::document::Accessor;
 use crate::{Error, Result};
 
 /// The type of a component.
@@ -61,6 +62,28 @@ impl Component {
         };
         if normalized { (integer as f32 / most).max(-1.0) } else { integer as f32 }
     }
+}
+
+/// Says what is wrong with an accessor by itself, against a view of `view_bytes` bytes and its stride.
+pub(super) fn fault(accessor: &Accessor, view: Option<(u64, Option<u64>)>) -> Option<String> {
+    let Some(component) = Component::of(accessor.component_type) else {
+        return Some(format!("has the component type `{}`", accessor.component_type));
+    };
+    let size = match (components(&accessor.shape), accessor.shape.as_str()) {
+        (Some(components), _) => components,
+        // Columns of matrices begin at multiples of four bytes; nothing here reads them
+        (None, "MAT2" | "MAT3" | "MAT4") => return None,
+        _ => return Some(format!("has the type `{}`", accessor.shape.escape_debug())),
+    };
+    if accessor.count == 0 {
+        return Some("has no elements".into());
+    }
+    let Some((length, stride)) = view else {
+        return (accessor.byte_offset > 0).then(|| "has an offset, but no buffer view".into());
+    };
+    let layout =
+        Layout::new((component, size), (accessor.byte_offset, stride), accessor.count, usize::try_from(length).ok()?);
+    layout.is_none().then(|| format!("does not fit its buffer view of {length} bytes"))
 }
 
 /// Components of a shape.

@@ -47,6 +47,7 @@ impl Container {
         budget.give(json.len() as u64);
         check_version(&document)?;
         check_extensions(&document.extensions_required)?;
+        super::check::check(&document)?;
         let buffers = document.buffers.iter().map(|_| None).collect();
         Ok(Self { path: path.to_path_buf(), document, budget, chunk, buffers })
     }
@@ -158,15 +159,17 @@ fn read_binary(
     if version != 2 {
         return Err(Error::unsupported(format!("GLB version {version}, version 2 can be read")).at_byte(path, 4));
     }
-    if stated != length {
+    if stated > length {
         let message = format!("the header says {stated} bytes, the file has {length}");
         return Err(Error::corrupt(path, 8, message).hint("the file may be cut off"));
     }
+    // What stands behind the stated end is not part of the asset
+    let length = stated;
     let mut offset = 12;
     let mut chunks = Vec::new();
     // The document, the binary chunk, and whatever extensions put behind them, which is not needed
     while offset < length && chunks.len() < 2 {
-        if length - offset < 8 {
+        if length.saturating_sub(offset) < 8 {
             return Err(Error::corrupt(path, offset, "the file ends inside a chunk's header"));
         }
         file.seek(SeekFrom::Start(offset)).map_err(io)?;
@@ -205,14 +208,37 @@ fn parse(json: &[u8], path: &Path, is_binary: bool, budget: &mut Budget) -> Resu
     // What a document takes when parsed, at most: an object up to 512 bytes, a value 64
     let objects = json.iter().filter(|&&b| b == b'{').count() as u64;
     let values = json.iter().filter(|&&b| b == b',').count() as u64;
-    budget.take(objects * 512 + values * 64 + json.len() as u64, "the parsed document")?;
-    serde_json::from_slice(json).map_err(|e| {
+    let bytes = objects * 512 + values * 64 + json.len() as u64;
+    budget.take(bytes, "the parsed document")?;
+    let mut parsed = serde_json::from_slice(json);
+    if matches!(&parsed, Err(e) if e.is_data()) && json.windows(2).any(|pair| pair == b".0") {
+        // Integers may be written with a fraction of zero (specification, section 2.7.1.1)
+        budget.take(bytes, "the parsed document")?;
+        let value = serde_json::from_slice(json).map(whole_numbers);
+        parsed = value.and_then(serde_json::from_value).or(parsed);
+        budget.give(bytes);
+    }
+    parsed.map_err(|e| {
         let error = Error::invalid(format!("the document cannot be read: {e}"));
         match is_binary {
             true => error.at(path),
             false => error.at_text(path, e.line().max(1) as u64, e.column().max(1) as u64),
         }
     })
+}
+
+/// Makes integers of numbers whose fraction is zero.
+fn whole_numbers(value: serde_json::Value) -> serde_json::Value {
+    use serde_json::Value;
+    match value {
+        Value::Number(number) => match number.as_f64() {
+            Some(x) if number.is_f64() && x.fract() == 0.0 && (0.0..9e15).contains(&x) => Value::from(x as u64),
+            _ => Value::Number(number),
+        },
+        Value::Array(values) => values.into_iter().map(whole_numbers).collect(),
+        Value::Object(map) => map.into_iter().map(|(key, value)| (key, whole_numbers(value))).collect(),
+        other => other,
+    }
 }
 
 fn check_version(document: &Document) -> Result<()> {

@@ -4,6 +4,7 @@
 //! precision, and whose accessors panic where a view is too short.
 
 mod accessor;
+mod check;
 mod container;
 mod document;
 mod nodes;
@@ -12,7 +13,7 @@ mod texture;
 
 use std::path::Path;
 
-use self::container::{Container, missing};
+use self::container::Container;
 use self::document::AlphaMode;
 use self::nodes::Copies;
 use super::emit::{self, Carried, Emitter};
@@ -24,10 +25,6 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let mut report = ImportReport::default();
     let mut container = Container::open(path, options.memory_bytes)?;
     let copies = nodes::copies(&mut container, options, &mut report)?;
-    let meshes = container.document.meshes.len();
-    if let Some(&mesh) = copies.keys().find(|&&mesh| mesh >= meshes) {
-        return Err(missing("mesh", mesh, meshes));
-    }
     let carried = carried(&container, &copies);
     let mut emitter = Emitter::new(sink, carried, options)?;
     let mut images = texture::Images::default();

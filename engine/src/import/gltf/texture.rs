@@ -143,8 +143,25 @@ fn transform(info: &TextureInfo) -> (u32, Option<(Vec2, Vec2, Vec2)>) {
     };
     let set = extension.get("texCoord").and_then(serde_json::Value::as_u64);
     let set = set.and_then(|set| u32::try_from(set).ok()).unwrap_or(info.tex_coord);
-    let rotation = number(extension.get("rotation")).unwrap_or(0.0) as f32;
-    (set, Some((pair("offset", 0.0), Vec2::from_angle(rotation), pair("scale", 1.0))))
+    let rotation = number(extension.get("rotation")).unwrap_or(0.0);
+    (set, Some((pair("offset", 0.0), direction(rotation), pair("scale", 1.0))))
+}
+
+/// Cosine and sine by their series, whose bits are the same on every machine; no rotation for an angle beyond reason.
+fn direction(angle: f64) -> Vec2 {
+    let turn = std::f64::consts::TAU;
+    let x = angle - (angle / turn).round() * turn;
+    if !(x.abs() <= 4.0) {
+        return Vec2::X;
+    }
+    let (mut cosine, mut sine, mut term) = (0.0, 0.0, 1.0);
+    // Terms alternate: x^n / n! goes to the cosine for even n, to the sine for odd n; 4^30 / 30! is below 1e-14
+    for n in 0..30 {
+        let sign = if n % 4 < 2 { 1.0 } else { -1.0 };
+        *(if n % 2 == 0 { &mut cosine } else { &mut sine }) += sign * term;
+        term *= x / f64::from(n + 1);
+    }
+    Vec2::new(cosine as f32, sine as f32)
 }
 
 fn decode(container: &mut Container, index: usize) -> Result<Image> {
@@ -344,7 +361,7 @@ mod tests {
     fn alpha_is_texture_times_factor_times_vertex() {
         let images = checker(64);
         let left = [Vec2::ZERO, Vec2::new(0.4, 0.0), Vec2::new(0.0, 0.9)];
-        let mut opacity = |mode, factor, vertex: f32| {
+        let opacity = |mode, factor, vertex: f32| {
             Averager::new(&images, &TEXTURE, mode, factor, 1).triangle(left, [vertex; 3]).opacity
         };
         assert_eq!(opacity(AlphaMode::Mask(0.5), 0.6, 1.0), 1.0);
@@ -362,6 +379,18 @@ mod tests {
             }
         }
         assert_eq!([Wrap::Repeat.texel(1.75, 8), Wrap::Mirror.texel(1.75, 8), Wrap::Clamp.texel(1.75, 8)], [6, 2, 7]);
+    }
+
+    /// Catches a texture transform in the wrong order or turning the wrong way (v points down).
+    #[test]
+    fn transforms_scale_then_turn_then_move() {
+        for angle in [0.0, 0.5, -2.0, 3.1, 40.0] {
+            assert!((direction(angle) - Vec2::from_angle(angle as f32)).length() < 1e-5, "{angle}");
+        }
+        let quarter = direction(std::f64::consts::FRAC_PI_2);
+        let transform = Some((Vec2::new(10.0, 20.0), quarter, Vec2::new(2.0, 3.0)));
+        let placed = Texture { transform, ..TEXTURE }.place(Vec2::new(1.0, 1.0));
+        assert!((placed - Vec2::new(13.0, 18.0)).length() < 1e-5, "{placed}");
     }
 
     /// Catches an image that decides how much memory it takes.

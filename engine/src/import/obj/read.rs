@@ -286,21 +286,25 @@ impl State {
         }
     }
 
-    /// Reads the libraries that a statement names: one whose name may hold spaces, or several.
+    /// Reads the libraries that a statement names: one whose name may hold spaces, or several. Those that are not
+    /// there are missed only when none is.
     fn libraries(&mut self, names: &[u8], report: &mut ImportReport) {
-        let whole = String::from_utf8_lossy(names);
-        if confine::beside(&self.path, &whole).is_ok() {
-            return self.library(&whole, report);
+        let whole = String::from_utf8_lossy(names).into_owned();
+        let names = match confine::beside(&self.path, &whole) {
+            Ok(_) => vec![whole],
+            Err(_) => split_names(&whole),
+        };
+        let mut failure = None;
+        let mut any = false;
+        for name in names {
+            let read = confine::beside(&self.path, &name)
+                .and_then(|path| mtl::read(&path, &mut self.materials, report));
+            match read {
+                Ok(()) => any = true,
+                Err(error) => failure = Some((name, error)),
+            }
         }
-        for name in lines::tokens(names) {
-            self.library(&String::from_utf8_lossy(name), report);
-        }
-    }
-
-    fn library(&mut self, name: &str, report: &mut ImportReport) {
-        let read = confine::beside(&self.path, name)
-            .and_then(|path| mtl::read(&path, &mut self.materials, report));
-        if let Err(error) = read {
+        if let Some((name, error)) = failure.filter(|_| !any) {
             report.warn(format!("material library `{}`: {}", name.escape_debug(), error.message()));
         }
     }
@@ -308,8 +312,20 @@ impl State {
     /// Checks the indices that were ahead, and hands over the mesh.
     fn finish(mut self, report: &mut ImportReport) -> Result<Mesh> {
         let positions = self.mesh.positions.len();
-        self.check_ahead(self.positions_ahead, positions, "vertex", "vertices")?;
-        self.check_ahead(self.normals_ahead, self.mesh.normals.len(), "normal", "normals")?;
+        if let Some(ahead) = self.positions_ahead.filter(|ahead| ahead.index >= positions as u64) {
+            return Err(Error::invalid(format!("vertex `{}` of {positions} vertices", ahead.index + 1))
+                .at_text(&self.path, ahead.line, ahead.column));
+        }
+        let normals = self.mesh.normals.len();
+        if let Some(ahead) = self.normals_ahead.filter(|ahead| ahead.index >= normals as u64) {
+            // Files of bare topology refer to normals that nobody wrote
+            let (line, column, index) = (ahead.line, ahead.column, ahead.index + 1);
+            report.warn(format!(
+                "normal `{index}` of {normals} (line {line}, column {column}): normals that are not there are computed"
+            ));
+            let is_missing = |normal: &&mut u32| **normal as usize >= normals;
+            self.mesh.corner_normals.iter_mut().filter(is_missing).for_each(|normal| *normal = NO_NORMAL);
+        }
         if self.materials.iter().any(|material| material.albedo.is_some()) {
             let albedos = self.materials.iter().map(|material| material.albedo.unwrap_or(ALBEDO_DEFAULT));
             self.mesh.palette = std::iter::once(ALBEDO_DEFAULT).chain(albedos).collect();
@@ -317,16 +333,23 @@ impl State {
         report.source.vertices = positions as u64;
         Ok(self.mesh)
     }
+}
 
-    fn check_ahead(&self, ahead: Option<Ahead>, count: usize, one: &str, many: &str) -> Result<()> {
-        match ahead {
-            Some(Ahead { index, line, column }) if index >= count as u64 => {
-                Err(Error::invalid(format!("{one} `{}` of {count} {many}", index + 1))
-                    .at_text(&self.path, line, column))
+/// Parts names at spaces; a backslash keeps the space behind it.
+fn split_names(text: &str) -> Vec<String> {
+    let mut names = vec![String::new()];
+    let mut chars = text.chars().peekable();
+    while let Some(c) = chars.next() {
+        match c {
+            '\\' if chars.peek() == Some(&' ') => {
+                names.last_mut().expect("never empty").extend(chars.next());
             }
-            _ => Ok(()),
+            ' ' | '\t' => names.push(String::new()),
+            c => names.last_mut().expect("never empty").push(c),
         }
     }
+    names.retain(|name| !name.is_empty());
+    names
 }
 
 /// Three numbers and up to `N`; how many there were.
