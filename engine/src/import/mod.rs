@@ -1,1 +1,174 @@
-//! stub
+//! Import: PLY, OBJ and glTF become compact microgrids, handed to a sink one by one (`docs/import.md`).
+//!
+//! Each format leaves an indexed [`mesh`] in memory; [`polygon`] turns what has more than four corners into
+//! triangles, [`cut`] parts the faces into clusters of at most 256 vertices, [`emit`] writes them out as microgrids.
+//! Nothing is allocated because a file says so: lengths are checked against the file's size, and the memory that a
+//! file needs is computed and compared with [`ImportOptions::memory_bytes`] before it is taken.
+
+mod budget;
+mod confine;
+mod cut;
+mod emit;
+mod gltf;
+mod lines;
+mod mesh;
+mod obj;
+mod ply;
+mod polygon;
+mod srgb;
+
+#[cfg(test)]
+mod assets;
+#[cfg(test)]
+mod hostile;
+
+use std::path::Path;
+
+use crate::stream::{Microgrid, Schema, schema::UpAxis};
+use crate::{Error, Result};
+
+/// Receives an imported stream: the schema once, then every grid in order.
+pub trait GridSink {
+    /// Learns the attributes and the space of the grids that follow.
+    ///
+    /// # Errors
+    /// When the sink cannot take such a stream; the import stops with this error.
+    fn begin(&mut self, schema: &Schema) -> Result<()>;
+
+    /// Takes the next grid. The memory stays with the caller.
+    ///
+    /// # Errors
+    /// When the sink cannot take it; the import stops with this error.
+    fn grid(&mut self, grid: &Microgrid) -> Result<()>;
+}
+
+/// The space to import into, and how much memory that may take.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImportOptions {
+    /// Metres per unit of the scene. glTF is in metres and converted; PLY and OBJ carry no unit and are taken as
+    /// they are.
+    pub meters_per_unit: f64,
+    /// The scene's up axis. glTF has +y up and is converted; PLY and OBJ carry no axis and are taken as they are.
+    pub up: UpAxis,
+    /// What the import may hold in memory at once, in bytes.
+    pub memory_bytes: u64,
+}
+
+impl Default for ImportOptions {
+    fn default() -> Self {
+        Self { meters_per_unit: 1.0, up: UpAxis::Y, memory_bytes: 1 << 30 }
+    }
+}
+
+/// What a file holds by its own count, before anything is split, skipped or placed in several copies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SourceCounts {
+    /// Positions that a file lists; for glTF the vertices of the primitives that a scene places.
+    pub vertices: u64,
+    /// Faces of three corners.
+    pub triangles: u64,
+    /// Faces of four corners.
+    pub quads: u64,
+    /// Faces of five corners and more.
+    pub ngons: u64,
+    /// Line segments.
+    pub lines: u64,
+    /// Points.
+    pub points: u64,
+}
+
+/// What an import did.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ImportReport {
+    /// Grids handed to the sink.
+    pub grids: u64,
+    /// Faces in these grids.
+    pub micropolygons: u64,
+    /// Vertices in these grids; one on a border between grids counts in each.
+    pub vertices: u64,
+    /// What the file holds by its own count.
+    pub source: SourceCounts,
+    /// What was left out: the reason, and how often.
+    pub skipped: Vec<(String, u64)>,
+    /// What was understood differently from what the file may have meant.
+    pub warnings: Vec<String>,
+}
+
+/// Distinct warnings that a report lists at most: a broken file may cause one per face.
+const WARNINGS_MAX: usize = 64;
+
+impl ImportReport {
+    /// Counts `count` things left out for `reason`.
+    fn skip(&mut self, reason: &str, count: u64) {
+        if count == 0 {
+            return;
+        }
+        match self.skipped.iter_mut().find(|(known, _)| known == reason) {
+            Some((_, known)) => *known += count,
+            None => self.skipped.push((reason.into(), count)),
+        }
+    }
+
+    /// Adds a warning, once, while there is room.
+    fn warn(&mut self, warning: String) {
+        if self.warnings.len() < WARNINGS_MAX && !self.warnings.contains(&warning) {
+            self.warnings.push(warning);
+        }
+    }
+}
+
+/// The formats read here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Format {
+    Ply,
+    Obj,
+    Gltf,
+}
+
+impl Format {
+    fn of(path: &Path) -> Option<Self> {
+        let extension = path.extension()?.to_str()?;
+        match extension.to_ascii_lowercase().as_str() {
+            "ply" => Some(Self::Ply),
+            "obj" => Some(Self::Obj),
+            "gltf" | "glb" => Some(Self::Gltf),
+            _ => None,
+        }
+    }
+}
+
+/// Whether [`import`] reads files of this name: `.ply`, `.obj`, `.gltf` or `.glb`, in any case.
+pub fn is_importable(path: &Path) -> bool {
+    Format::of(path).is_some()
+}
+
+/// Reads `path` and hands its geometry to `sink` as microgrids. Same file and options, same grids.
+///
+/// # Errors
+/// [`Unsupported`](crate::ErrorKind::Unsupported) for other formats and for extensions that this version cannot
+/// read, [`Limit`](crate::ErrorKind::Limit) when the file needs more than [`ImportOptions::memory_bytes`],
+/// [`Corrupt`](crate::ErrorKind::Corrupt) or [`Invalid`](crate::ErrorKind::Invalid) with the place for a broken
+/// file, and whatever the sink returns. Grids handed over before an error are valid, but not all there are.
+pub fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {
+    let Some(format) = Format::of(path) else {
+        return Err(Error::unsupported("this is not a format that can be imported")
+            .at(path)
+            .hint("files of these names are read: .ply .obj .gltf .glb"));
+    };
+    if !(options.meters_per_unit.is_finite() && options.meters_per_unit > 0.0) {
+        return Err(Error::invalid(format!(
+            "`{}` metres per unit is not a positive number",
+            options.meters_per_unit
+        )));
+    }
+    let mut report = match format {
+        Format::Ply => ply::import(path, options, sink),
+        Format::Obj => obj::import(path, options, sink),
+        Format::Gltf => gltf::import(path, options, sink),
+    }
+    .map_err(|error| error.at(path))?;
+    if report.micropolygons == 0 {
+        report.warn("there is no geometry in this file".into());
+    }
+    Ok(report)
+}

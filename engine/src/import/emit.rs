@@ -1,0 +1,327 @@
+//! Clusters of a mesh become microgrids in world space.
+//!
+//! Positions keep what they have. A mesh of single precision numbers that is not moved is written as it is, with the
+//! anchor at the origin. Any other is rounded to a power of two that a grid of its size resolves in single precision,
+//! per vertex the coarsest of the grids that share it: so a shared vertex is the same number in all of them.
+
+use glam::{DMat3, DMat4, DVec3, Vec3};
+
+use super::cut::{Clusters, VertexKey, VertexTable};
+use super::mesh::{COORDINATE_MAX, Face, Mesh, NO_NORMAL};
+use super::{GridSink, ImportReport, polygon, srgb};
+use crate::Result;
+use crate::stream::schema::names;
+use crate::stream::{Attribute, Microgrid, Schema, ValueType};
+
+/// Which attributes a stream carries, decided before its first grid.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Carried {
+    /// `N`.
+    pub normal: bool,
+    /// `albedo`.
+    pub albedo: bool,
+    /// `opacity`.
+    pub opacity: bool,
+    /// `radius`.
+    pub radius: bool,
+}
+
+impl Carried {
+    /// What a finished mesh needs.
+    pub fn by(mesh: &Mesh) -> Self {
+        Self {
+            normal: mesh.has_normals(),
+            albedo: !mesh.colors.is_empty() || !mesh.palette.is_empty(),
+            opacity: mesh.has_opacity(),
+            radius: mesh.has_radii(),
+        }
+    }
+
+    /// The attributes in their order: `N albedo opacity radius id`.
+    fn attributes(self) -> Vec<Attribute> {
+        let all = [
+            (self.normal, Attribute::vertex(names::NORMAL, ValueType::F32, 3)),
+            (self.albedo, Attribute::vertex(names::ALBEDO, ValueType::U8, 3)),
+            (self.opacity, Attribute::vertex(names::OPACITY, ValueType::U8, 1)),
+            (self.radius, Attribute::vertex(names::RADIUS, ValueType::F32, 1)),
+            (true, Attribute::grid(names::ID, ValueType::U32, 1)),
+        ];
+        all.into_iter().filter(|(carried, _)| *carried).map(|(_, attribute)| attribute).collect()
+    }
+}
+
+/// Where a copy of a mesh stands.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Placement {
+    world_from_mesh: DMat4,
+    /// Takes normals along: the cofactors, which are the inverse transpose up to a positive factor once the sign of
+    /// the determinant is put right.
+    world_from_normal: DMat3,
+    mirrored: bool,
+    /// Radii grow by this.
+    scale: f64,
+    identity: bool,
+}
+
+impl Placement {
+    /// The placement that leaves a mesh where it is.
+    pub const HERE: Self = Self {
+        world_from_mesh: DMat4::IDENTITY,
+        world_from_normal: DMat3::IDENTITY,
+        mirrored: false,
+        scale: 1.0,
+        identity: true,
+    };
+
+    /// A placement, unless the matrix is not finite or flattens space.
+    pub fn new(world_from_mesh: DMat4) -> Option<Self> {
+        let linear = DMat3::from_mat4(world_from_mesh);
+        let determinant = linear.determinant();
+        let usable = world_from_mesh.is_finite() && determinant.is_finite() && determinant != 0.0;
+        if !usable {
+            return None;
+        }
+        let [x, y, z] = [linear.x_axis, linear.y_axis, linear.z_axis];
+        let cofactors = DMat3::from_cols(y.cross(z), z.cross(x), x.cross(y));
+        Some(Self {
+            world_from_mesh,
+            world_from_normal: cofactors * determinant.signum(),
+            mirrored: determinant < 0.0,
+            // The mean of the axes' lengths: exact for uniform scales, and free of functions that differ by platform
+            scale: (x.length() + y.length() + z.length()) / 3.0,
+            identity: world_from_mesh == DMat4::IDENTITY,
+        })
+    }
+
+    fn point(&self, point: DVec3) -> DVec3 {
+        if self.identity { point } else { self.world_from_mesh.transform_point3(point) }
+    }
+
+    fn normal(&self, normal: Vec3) -> Vec3 {
+        if self.identity {
+            return normal.normalize_or_zero();
+        }
+        (self.world_from_normal * normal.as_dvec3()).normalize_or_zero().as_vec3()
+    }
+}
+
+/// Hands grids to a sink and counts them.
+pub(super) struct Emitter<'a> {
+    sink: &'a mut dyn GridSink,
+    schema: Schema,
+    carried: Carried,
+    grid: Microgrid,
+    table: VertexTable,
+    /// Power of two per position, see [`Emitter::measure`]; empty when positions are written as they are.
+    exponents: Vec<i16>,
+    points: Vec<DVec3>,
+}
+
+/// Albedo where nothing says otherwise, as everywhere in the engine: a half.
+const ALBEDO_DEFAULT: [u8; 3] = [128; 3];
+
+/// Smallest power of two for rounding; below it nothing can be told apart.
+const EXPONENT_MIN: i16 = -200;
+
+impl<'a> Emitter<'a> {
+    /// Begins a stream.
+    pub fn new(sink: &'a mut dyn GridSink, carried: Carried, options: &super::ImportOptions) -> Result<Self> {
+        let schema = Schema {
+            meters_per_unit: options.meters_per_unit,
+            up: options.up,
+            attributes: carried.attributes(),
+        };
+        schema.validate()?;
+        sink.begin(&schema)?;
+        Ok(Self {
+            sink,
+            schema,
+            carried,
+            grid: Microgrid::default(),
+            table: VertexTable::new(),
+            exponents: Vec::new(),
+            points: Vec::new(),
+        })
+    }
+
+    /// Writes a copy of a mesh. Faces carry their object's number as `id`, from `first_id`.
+    pub fn emit(
+        &mut self,
+        mesh: &Mesh,
+        clusters: &Clusters,
+        placement: &Placement,
+        (first_id, radius): (u32, f32),
+        report: &mut ImportReport,
+    ) -> Result<()> {
+        let corners = mesh.bounds();
+        let far = |p: DVec3| !placement.point(p).abs().cmple(DVec3::splat(COORDINATE_MAX)).all();
+        if !corners.is_empty() && (far(corners.min) || far(corners.max)) {
+            report.skip("copies that stand out of range", 1);
+            return Ok(());
+        }
+        self.measure(mesh, clusters, placement);
+        for cluster in clusters.iter() {
+            self.fill(mesh, cluster, placement, radius);
+            let id = first_id.wrapping_add(mesh.faces[cluster[0] as usize].object);
+            let column = self.schema.attributes.len() - 1;
+            self.grid.columns[column].extend_from_slice(&id.to_le_bytes());
+            debug_assert!(self.grid.validate(&self.schema).is_ok(), "{:?}", self.grid.validate(&self.schema));
+            report.grids += 1;
+            report.micropolygons += self.grid.face_count() as u64;
+            report.vertices += self.grid.vertex_count() as u64;
+            self.sink.grid(&self.grid)?;
+        }
+        Ok(())
+    }
+
+    /// Finds for every position the power of two to round to.
+    fn measure(&mut self, mesh: &Mesh, clusters: &Clusters, placement: &Placement) {
+        self.exponents.clear();
+        if placement.identity && mesh.single_precision {
+            return;
+        }
+        self.exponents.resize(mesh.positions.len(), EXPONENT_MIN);
+        for cluster in clusters.iter() {
+            let mut bounds = crate::math::Bounds::EMPTY;
+            let corners = |face: &u32| mesh.face_corners(&mesh.faces[*face as usize]);
+            for &corner in cluster.iter().flat_map(corners) {
+                bounds.add(placement.point(mesh.positions[corner as usize]));
+            }
+            let exponent = resolution(bounds.size().max_element());
+            for &corner in cluster.iter().flat_map(corners) {
+                let known = &mut self.exponents[corner as usize];
+                *known = exponent.max(*known);
+            }
+        }
+    }
+
+    /// Makes the grid of one cluster, but for its `id`.
+    fn fill(&mut self, mesh: &Mesh, cluster: &[u32], placement: &Placement, radius: f32) {
+        self.grid.clear(self.schema.attributes.len());
+        self.table.clear();
+        self.points.clear();
+        for &index in cluster {
+            let face = &mesh.faces[index as usize];
+            let mut indices = [0_u8; 4];
+            for (i, slot) in indices.iter_mut().enumerate().take(face.arity as usize) {
+                let corner = face.start as usize + i;
+                let (vertex, is_new) = self.table.add(VertexKey::new(mesh, face, corner));
+                *slot = vertex as u8;
+                if is_new {
+                    self.push_vertex(mesh, face, corner, placement, radius);
+                }
+            }
+            let indices = &mut indices[..face.arity as usize];
+            if placement.mirrored && face.arity > 2 {
+                // Keeps the first corner, and with it a quad's diagonal
+                indices[1..].reverse();
+            }
+            self.grid.push_face(indices);
+        }
+        self.place();
+    }
+
+    fn push_vertex(&mut self, mesh: &Mesh, face: &Face, corner: usize, placement: &Placement, radius: f32) {
+        let position = mesh.corners[corner] as usize;
+        let mut point = placement.point(mesh.positions[position]);
+        if let Some(&exponent) = self.exponents.get(position) {
+            let step = power_of_two(exponent);
+            point = (point / step).round() * step;
+        }
+        self.points.push(point);
+        let mut column = 0;
+        let mut next = |carried: bool| carried.then(|| (column, column += 1).0);
+        if let Some(column) = next(self.carried.normal) {
+            let normal = corner_normal(mesh, face, corner, placement);
+            for value in normal.to_array() {
+                self.grid.columns[column].extend_from_slice(&value.to_le_bytes());
+            }
+        }
+        if let Some(column) = next(self.carried.albedo) {
+            let from_palette = || mesh.palette.get(face.material as usize).copied().unwrap_or(ALBEDO_DEFAULT);
+            let albedo = mesh.colors.get(position).copied().unwrap_or_else(from_palette);
+            self.grid.columns[column].extend_from_slice(&albedo);
+        }
+        if let Some(column) = next(self.carried.opacity) {
+            let opacity = mesh.opacities.get(position).copied().unwrap_or(face.opacity);
+            self.grid.columns[column].push(opacity);
+        }
+        if let Some(column) = next(self.carried.radius) {
+            let own = match mesh.radii.get(position) {
+                _ if face.arity > 2 => 0.0,
+                Some(&radius) if radius.is_finite() && radius >= 0.0 => f64::from(radius),
+                _ => f64::from(radius),
+            };
+            let radius = (own * placement.scale) as f32;
+            self.grid.columns[column].extend_from_slice(&radius.to_le_bytes());
+        }
+    }
+
+    /// Chooses the anchor and stores positions as offsets from it.
+    fn place(&mut self) {
+        if !self.exponents.is_empty() {
+            let mut bounds = crate::math::Bounds::EMPTY;
+            self.points.iter().for_each(|&point| bounds.add(point));
+            let step = power_of_two(resolution(bounds.size().max_element()));
+            self.grid.anchor = (bounds.center() / step).round() * step;
+        }
+        let anchor = self.grid.anchor;
+        self.grid.positions.extend(self.points.iter().map(|&point| (point - anchor).as_vec3()));
+    }
+}
+
+/// A corner's unit normal in world space: the file's, else the smooth one, else that of the face; zero for points and
+/// lines without one.
+fn corner_normal(mesh: &Mesh, face: &Face, corner: usize, placement: &Placement) -> Vec3 {
+    let position = mesh.corners[corner] as usize;
+    let index = mesh.normal_index(corner);
+    let given = if index == NO_NORMAL { mesh.smooth.get(position) } else { mesh.normals.get(index as usize) };
+    let normal = placement.normal(given.copied().unwrap_or(Vec3::ZERO));
+    if normal != Vec3::ZERO && normal.is_finite() || face.arity < 3 {
+        return if normal.is_finite() { normal } else { Vec3::ZERO };
+    }
+    let mut points = [DVec3::ZERO; 4];
+    let corners = mesh.face_corners(face);
+    for (point, &corner) in points.iter_mut().zip(corners) {
+        *point = mesh.positions[corner as usize];
+    }
+    let normal = polygon::area_normal(&points[..corners.len()]).normalize_or_zero();
+    placement.normal(normal.as_vec3())
+}
+
+/// The exponent of the finest power of two of which a box of this size holds at most 2^24 along an edge.
+fn resolution(size: f64) -> i16 {
+    // The exponent of the next power of two, from the bits: the same on every machine
+    let exponent = ((size.to_bits() >> 52) & 0x7ff) as i16 - 1023 + 1;
+    (exponent - 24).max(EXPONENT_MIN)
+}
+
+/// 2 to an exponent of a normal number.
+fn power_of_two(exponent: i16) -> f64 {
+    f64::from_bits(((i64::from(exponent) + 1023) as u64) << 52)
+}
+
+/// The radius of points and lines that have none: for points half the spacing that as many would have on a flat
+/// square as wide as the mesh, at most a hundredth of its diagonal; a thousandth of the diagonal for lines; a
+/// millimetre where the diagonal is zero. Returned for the mesh as a whole, by what there is more of.
+pub(super) fn default_radius(mesh: &Mesh, meters_per_unit: f64) -> f32 {
+    let diagonal = mesh.bounds().size().length();
+    let points = mesh.faces.iter().filter(|face| face.arity == 1).count();
+    let lines = mesh.faces.iter().filter(|face| face.arity == 2).count();
+    let share = if lines > points { 0.001 } else { (0.5 / (points.max(1) as f64).sqrt()).min(0.01) };
+    let radius = diagonal * share;
+    if radius > 0.0 { radius as f32 } else { (0.001 / meters_per_unit) as f32 }
+}
+
+/// Warns that points or lines got a radius that nobody gave.
+pub(super) fn warn_radius(mesh: &Mesh, radius: f32, report: &mut ImportReport) {
+    if mesh.radii.is_empty() && mesh.has_radii() {
+        report.warn(format!("points or lines without a radius were given `{radius:.4}`"));
+    }
+}
+
+/// The byte of an opacity in 0 to 1. What covers anything at all stays above zero.
+pub(super) fn opacity_byte(opacity: f32) -> u8 {
+    let byte = srgb::unit_byte(opacity);
+    if opacity > 0.0 { byte.max(1) } else { byte }
+}

@@ -1,0 +1,80 @@
+//! glTF 2.0, as text or binary: node hierarchy, instances, and base colour into `albedo` and `opacity`.
+//!
+//! The document is read by structures of its own rather than by the `gltf` crate, whose node transforms are single
+//! precision, and whose accessors panic where a view is too short.
+
+mod accessor;
+mod check;
+mod container;
+mod document;
+mod nodes;
+mod primitive;
+mod texture;
+
+use std::path::Path;
+
+use self::container::Container;
+use self::document::AlphaMode;
+use self::nodes::Copies;
+use super::emit::{self, Carried, Emitter};
+use super::{GridSink, ImportOptions, ImportReport, cut};
+use crate::Result;
+
+/// Imports a glTF or GLB file.
+pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {
+    let mut report = ImportReport::default();
+    let mut container = Container::open(path, options.memory_bytes)?;
+    let copies = nodes::copies(&mut container, options, &mut report)?;
+    let carried = carried(&container, &copies);
+    let mut emitter = Emitter::new(sink, carried, options)?;
+    let mut images = texture::Images::default();
+    for (&mesh, places) in &copies {
+        if container.document.meshes[mesh].weights.iter().any(|&weight| weight != 0.0) {
+            report.warn("morph targets are not applied: meshes stand as modelled".into());
+        }
+        for index in 0..container.document.meshes[mesh].primitives.len() {
+            let mut own = ImportReport::default();
+            let read = primitive::read(&mut container, (mesh, index), &mut images, carried.albedo, &mut own)?;
+            add_copies(&mut report, &own, places.len() as u64);
+            let Some((mesh, bytes)) = read else { continue };
+            let radius = emit::default_radius(&mesh, 1.0);
+            emit::warn_radius(&mesh, radius, &mut report);
+            let clusters = cut::cut(&mesh);
+            for (id, placement) in places {
+                emitter.emit(&mesh, &clusters, placement, (*id, radius), &mut report)?;
+            }
+            drop(mesh);
+            container.budget.give(bytes);
+        }
+    }
+    Ok(report)
+}
+
+/// The attributes that the placed primitives need, by what the document says of them.
+fn carried(container: &Container, copies: &Copies) -> Carried {
+    let document = &container.document;
+    let mut carried = Carried::default();
+    for primitive in copies.keys().flat_map(|&mesh| &document.meshes[mesh].primitives) {
+        let mode = primitive.mode.unwrap_or(4);
+        let material = primitive.material.and_then(|material| document.materials.get(material));
+        let alpha = material.and_then(|material| material.alpha());
+        carried.normal |= mode > 3 || primitive.attributes.contains_key("NORMAL");
+        carried.radius |= mode < 4;
+        carried.albedo |= material.is_some() || primitive.attributes.contains_key("COLOR_0");
+        carried.opacity |= alpha.is_some_and(|alpha| alpha != AlphaMode::Opaque);
+    }
+    carried
+}
+
+/// Adds what was found in a primitive, as often as it is placed.
+fn add_copies(report: &mut ImportReport, own: &ImportReport, copies: u64) {
+    let (sum, source) = (&mut report.source, own.source);
+    sum.vertices += source.vertices * copies;
+    sum.triangles += source.triangles * copies;
+    sum.lines += source.lines * copies;
+    sum.points += source.points * copies;
+    for (reason, count) in &own.skipped {
+        report.skip(reason, count * copies);
+    }
+    own.warnings.iter().for_each(|warning| report.warn(warning.clone()));
+}

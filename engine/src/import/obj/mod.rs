@@ -1,0 +1,23 @@
+//! Wavefront OBJ: polygons, lines and points with normals, groups, materials and the vertex colour extension.
+
+mod mtl;
+mod read;
+
+use std::path::Path;
+
+use super::emit::{self, Carried, Emitter, Placement};
+use super::{GridSink, ImportOptions, ImportReport, cut};
+use crate::Result;
+
+/// Imports an OBJ file.
+pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {
+    let mut report = ImportReport::default();
+    let mut mesh = read::read(path, options, &mut report)?;
+    mesh.finish(&mut report)?;
+    let radius = emit::default_radius(&mesh, options.meters_per_unit);
+    emit::warn_radius(&mesh, radius, &mut report);
+    let clusters = cut::cut(&mesh);
+    let mut emitter = Emitter::new(sink, Carried::by(&mesh), options)?;
+    emitter.emit(&mesh, &clusters, &Placement::HERE, (0, radius), &mut report)?;
+    Ok(report)
+}

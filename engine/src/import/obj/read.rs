@@ -1,0 +1,404 @@
+//! Reads the text of an OBJ file into a mesh: once to count what it needs, once to take it.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use glam::{DVec3, Vec3};
+
+use super::mtl::{self, Material, rest_of};
+use crate::import::budget::Budget;
+use crate::import::lines::{self, LineReader};
+use crate::import::mesh::{Face, Mesh, NO_NORMAL};
+use crate::import::{ImportOptions, ImportReport, confine};
+use crate::{Error, ErrorKind, Result};
+
+/// Statements that describe curves and surfaces of higher order.
+const FREE_FORM: [&[u8]; 19] = [
+    b"vp", b"deg", b"bmat", b"step", b"cstype", b"curv", b"curv2", b"surf", b"parm", b"trim", b"hole", b"scrv",
+    b"sp", b"end", b"con", b"bzp", b"bsp", b"cdc", b"res",
+];
+
+/// Statements that say nothing about shape or colour, or that are done without.
+const IGNORED: [&[u8]; 12] = [
+    b"vt", b"s", b"mg", b"usemap", b"maplib", b"bevel", b"c_interp", b"d_interp", b"lod", b"shadow_obj",
+    b"trace_obj", b"vw",
+];
+
+/// Albedo of materials that have none.
+const ALBEDO_DEFAULT: [u8; 3] = [128; 3];
+
+/// Reads the file at `path`.
+pub(super) fn read(path: &Path, options: &ImportOptions, report: &mut ImportReport) -> Result<Mesh> {
+    let counts = count(path)?;
+    let mut budget = Budget::new(options.memory_bytes, path);
+    let bytes = Mesh::bytes(counts.vertices + counts.normals / 2, counts.corners, counts.faces);
+    budget.take(bytes.saturating_add(counts.name_bytes), "the mesh")?;
+    if u32::try_from(counts.vertices.max(counts.normals)).is_err() {
+        return Err(Error::new(ErrorKind::Limit, "more than 4,294,967,295 vertices or normals"));
+    }
+    let mut reader = LineReader::open(path)?;
+    let mut state = State::new(path, counts.normals > 0);
+    state.mesh.positions.reserve_exact(counts.vertices as usize);
+    state.mesh.normals.reserve_exact(counts.normals as usize);
+    while reader.advance(true)? {
+        state.statement(&reader, report)?;
+    }
+    state.finish(report)
+}
+
+/// What the arrays of a mesh will hold, at most.
+#[derive(Debug, Default)]
+struct Counts {
+    vertices: u64,
+    normals: u64,
+    corners: u64,
+    faces: u64,
+    name_bytes: u64,
+}
+
+fn count(path: &Path) -> Result<Counts> {
+    let mut reader = LineReader::open(path)?;
+    let mut counts = Counts::default();
+    while reader.advance(true)? {
+        let mut words = lines::tokens(reader.line());
+        match words.next() {
+            Some(b"v") => counts.vertices += 1,
+            Some(b"vn") => counts.normals += 1,
+            Some(b"f") => {
+                // A polygon of n corners becomes n - 2 triangles beside itself
+                let n = words.count() as u64;
+                let triangles = n.saturating_sub(2);
+                counts.faces += if n > 4 { 1 + triangles } else { 1 };
+                counts.corners += if n > 4 { n + 3 * triangles } else { n };
+            }
+            Some(b"l" | b"p") => {
+                let n = words.count() as u64;
+                counts.faces += n;
+                counts.corners += 2 * n;
+            }
+            // A name in a hash table costs about 64 bytes besides itself
+            Some(b"o" | b"g") => counts.name_bytes += 2 * reader.line().len() as u64 + 64,
+            _ => {}
+        }
+    }
+    Ok(counts)
+}
+
+/// The furthest index that was ahead of what it refers to, and where it stood.
+#[derive(Clone, Copy, Debug)]
+struct Ahead {
+    index: u64,
+    line: u64,
+    column: u64,
+}
+
+struct State {
+    path: PathBuf,
+    mesh: Mesh,
+    has_normals: bool,
+    /// Object and group names; together they name what gets an `id`.
+    object: Vec<u8>,
+    group: Vec<u8>,
+    ids: HashMap<Vec<u8>, u32>,
+    id: Option<u32>,
+    materials: Vec<Material>,
+    /// Material and opacity of the faces that follow; 0 is no material.
+    material: u32,
+    opacity: u8,
+    positions_ahead: Option<Ahead>,
+    normals_ahead: Option<Ahead>,
+    corners: Vec<u32>,
+    corner_normals: Vec<u32>,
+}
+
+impl State {
+    fn new(path: &Path, has_normals: bool) -> Self {
+        Self {
+            path: path.to_path_buf(),
+            mesh: Mesh { single_precision: true, ..Mesh::default() },
+            has_normals,
+            object: Vec::new(),
+            group: Vec::new(),
+            ids: HashMap::new(),
+            id: None,
+            materials: Vec::new(),
+            material: 0,
+            opacity: 255,
+            positions_ahead: None,
+            normals_ahead: None,
+            corners: Vec::new(),
+            corner_normals: Vec::new(),
+        }
+    }
+
+    /// Takes one line.
+    fn statement(&mut self, reader: &LineReader, report: &mut ImportReport) -> Result<()> {
+        let line = reader.line();
+        let mut words = lines::tokens(line).take_while(|word| word[0] != b'#');
+        let Some(keyword) = words.next() else { return Ok(()) };
+        match keyword {
+            b"v" => self.vertex(reader, keyword, words),
+            b"vn" => self.normal(reader, keyword, words),
+            b"f" | b"fo" | b"l" | b"p" => {
+                self.corners.clear();
+                self.corner_normals.clear();
+                for word in words {
+                    self.corner(reader, word)?;
+                }
+                self.element(keyword, report)
+            }
+            b"o" | b"g" => {
+                let name = rest_of(line, keyword).to_vec();
+                *(if keyword == b"o" { &mut self.object } else { &mut self.group }) = name;
+                self.id = None;
+                Ok(())
+            }
+            b"usemtl" => {
+                self.use_material(rest_of(line, keyword), report);
+                Ok(())
+            }
+            b"mtllib" => {
+                self.libraries(rest_of(line, keyword), report);
+                Ok(())
+            }
+            _ if IGNORED.contains(&keyword) => Ok(()),
+            _ if FREE_FORM.contains(&keyword) => {
+                report.skip("statements of curves and surfaces of higher order", 1);
+                Ok(())
+            }
+            _ => {
+                report.skip("unknown statements", 1);
+                Ok(())
+            }
+        }
+    }
+
+    /// `v x y z [w]` or `v x y z [w] r g b`.
+    fn vertex<'a>(
+        &mut self,
+        reader: &LineReader,
+        keyword: &[u8],
+        words: impl Iterator<Item = &'a [u8]>,
+    ) -> Result<()> {
+        let (values, count) = numbers::<7>(reader, keyword, words)?;
+        let position = DVec3::new(values[0], values[1], values[2]);
+        self.mesh.single_precision &= position.as_vec3().as_dvec3() == position;
+        let color = match count {
+            6 => Some([values[3], values[4], values[5]]),
+            7 => Some([values[4], values[5], values[6]]),
+            _ => None,
+        };
+        if color.is_some() && self.mesh.colors.is_empty() {
+            self.mesh.colors.resize(self.mesh.positions.len(), ALBEDO_DEFAULT);
+        }
+        self.mesh.positions.push(position);
+        if color.is_some() || !self.mesh.colors.is_empty() {
+            let byte = |value: f64| crate::import::srgb::unit_byte(value as f32);
+            self.mesh.colors.push(color.map_or(ALBEDO_DEFAULT, |color| color.map(byte)));
+        }
+        Ok(())
+    }
+
+    fn normal<'a>(
+        &mut self,
+        reader: &LineReader,
+        keyword: &[u8],
+        words: impl Iterator<Item = &'a [u8]>,
+    ) -> Result<()> {
+        let (values, _) = numbers::<3>(reader, keyword, words)?;
+        self.mesh.normals.push(Vec3::from_array(values.map(|value| value as f32)));
+        Ok(())
+    }
+
+    /// `v`, `v/vt`, `v//vn` or `v/vt/vn`.
+    fn corner(&mut self, reader: &LineReader, word: &[u8]) -> Result<()> {
+        let mut parts = word.split(|&b| b == b'/');
+        let position = parts.next().unwrap_or_default();
+        let texture = parts.next().unwrap_or_default();
+        let normal = parts.next().unwrap_or_default();
+        let count = self.mesh.positions.len();
+        let position = index(reader, word, position, count, "vertex", &mut self.positions_ahead)?;
+        if !texture.is_empty() {
+            integer(reader, word, texture)?;
+        }
+        let normal = match normal {
+            b"" => NO_NORMAL,
+            _ => {
+                let count = self.mesh.normals.len();
+                index(reader, word, normal, count, "normal", &mut self.normals_ahead)?
+            }
+        };
+        self.corners.push(position);
+        self.corner_normals.push(normal);
+        Ok(())
+    }
+
+    /// Makes faces of the corners that a statement lists.
+    fn element(&mut self, keyword: &[u8], report: &mut ImportReport) -> Result<()> {
+        let corners = std::mem::take(&mut self.corners);
+        let normals = std::mem::take(&mut self.corner_normals);
+        let arity = match keyword {
+            b"p" => 1,
+            b"l" => 2,
+            _ => corners.len().max(3),
+        };
+        if corners.len() < arity {
+            let few = if arity == 2 { "lines of one point" } else { "faces of fewer than three corners" };
+            report.skip(few, u64::from(arity > 1));
+        } else {
+            let face = self.face();
+            for start in 0..=corners.len() - arity {
+                self.mesh.push_face(face, &corners[start..start + arity], report)?;
+                if self.has_normals {
+                    self.mesh.corner_normals.extend_from_slice(&normals[start..start + arity]);
+                }
+            }
+        }
+        (self.corners, self.corner_normals) = (corners, normals);
+        Ok(())
+    }
+
+    /// A face as the statements before it say.
+    fn face(&mut self) -> Face {
+        let object = *self.id.get_or_insert_with(|| {
+            let name = [self.object.as_slice(), &self.group].join(&0);
+            let next = self.ids.len() as u32;
+            *self.ids.entry(name).or_insert(next)
+        });
+        Face { start: 0, arity: 0, material: self.material, object, opacity: self.opacity }
+    }
+
+    fn use_material(&mut self, name: &[u8], report: &mut ImportReport) {
+        match self.materials.iter().rposition(|material| material.name == name) {
+            Some(found) => {
+                self.material = found as u32 + 1;
+                self.opacity = self.materials[found].opacity;
+                if self.opacity == 0 {
+                    let name = String::from_utf8_lossy(name).into_owned();
+                    report.warn(format!("material `{}` is fully transparent", name.escape_debug()));
+                }
+            }
+            None => {
+                (self.material, self.opacity) = (0, 255);
+                let name = String::from_utf8_lossy(&name[..name.len().min(80)]).into_owned();
+                report.warn(format!("material `{}` is not defined", name.escape_debug()));
+            }
+        }
+    }
+
+    /// Reads the libraries that a statement names: one whose name may hold spaces, or several. Those that are not
+    /// there are missed only when none is.
+    fn libraries(&mut self, names: &[u8], report: &mut ImportReport) {
+        let whole = String::from_utf8_lossy(names).into_owned();
+        let names = match confine::beside(&self.path, &whole) {
+            Ok(_) => vec![whole],
+            Err(_) => split_names(&whole),
+        };
+        let mut failure = None;
+        let mut any = false;
+        for name in names {
+            let read = confine::beside(&self.path, &name)
+                .and_then(|path| mtl::read(&path, &mut self.materials, report));
+            match read {
+                Ok(()) => any = true,
+                Err(error) => failure = Some((name, error)),
+            }
+        }
+        if let Some((name, error)) = failure.filter(|_| !any) {
+            report.warn(format!("material library `{}`: {}", name.escape_debug(), error.message()));
+        }
+    }
+
+    /// Checks the indices that were ahead, and hands over the mesh.
+    fn finish(mut self, report: &mut ImportReport) -> Result<Mesh> {
+        let positions = self.mesh.positions.len();
+        if let Some(ahead) = self.positions_ahead.filter(|ahead| ahead.index >= positions as u64) {
+            return Err(Error::invalid(format!("vertex `{}` of {positions} vertices", ahead.index + 1))
+                .at_text(&self.path, ahead.line, ahead.column));
+        }
+        let normals = self.mesh.normals.len();
+        if let Some(ahead) = self.normals_ahead.filter(|ahead| ahead.index >= normals as u64) {
+            // Files of bare topology refer to normals that nobody wrote
+            let (line, column, index) = (ahead.line, ahead.column, ahead.index + 1);
+            report.warn(format!(
+                "normal `{index}` of {normals} (line {line}, column {column}): normals that are not there are computed"
+            ));
+            let is_missing = |normal: &&mut u32| **normal as usize >= normals;
+            self.mesh.corner_normals.iter_mut().filter(is_missing).for_each(|normal| *normal = NO_NORMAL);
+        }
+        if self.materials.iter().any(|material| material.albedo.is_some()) {
+            let albedos = self.materials.iter().map(|material| material.albedo.unwrap_or(ALBEDO_DEFAULT));
+            self.mesh.palette = std::iter::once(ALBEDO_DEFAULT).chain(albedos).collect();
+        }
+        report.source.vertices = positions as u64;
+        Ok(self.mesh)
+    }
+}
+
+/// Parts names at spaces; a backslash keeps the space behind it.
+fn split_names(text: &str) -> Vec<String> {
+    let mut names = vec![String::new()];
+    let mut chars = text.chars().peekable();
+    while let Some(c) = chars.next() {
+        match c {
+            '\\' if chars.peek() == Some(&' ') => {
+                names.last_mut().expect("never empty").extend(chars.next());
+            }
+            ' ' | '\t' => names.push(String::new()),
+            c => names.last_mut().expect("never empty").push(c),
+        }
+    }
+    names.retain(|name| !name.is_empty());
+    names
+}
+
+/// Three numbers and up to `N`; how many there were.
+fn numbers<'a, const N: usize>(
+    reader: &LineReader,
+    keyword: &[u8],
+    words: impl Iterator<Item = &'a [u8]>,
+) -> Result<([f64; N], usize)> {
+    let mut values = [0.0; N];
+    let mut count = 0;
+    for (slot, word) in values.iter_mut().zip(words) {
+        *slot = lines::number(word).ok_or_else(|| {
+            let text = String::from_utf8_lossy(&word[..word.len().min(40)]).into_owned();
+            reader.error(ErrorKind::Invalid, word, format!("`{}` is not a number", text.escape_default()))
+        })?;
+        count += 1;
+    }
+    if count < 3 {
+        return Err(reader.error(ErrorKind::Invalid, keyword, format!("{count} numbers, at least 3 expected")));
+    }
+    Ok((values, count))
+}
+
+fn integer(reader: &LineReader, word: &[u8], digits: &[u8]) -> Result<i64> {
+    std::str::from_utf8(digits).ok().and_then(|text| text.parse().ok()).ok_or_else(|| {
+        let text = String::from_utf8_lossy(&digits[..digits.len().min(40)]).into_owned();
+        reader.error(ErrorKind::Invalid, word, format!("`{}` is not an index", text.escape_default()))
+    })
+}
+
+/// An index from 0. In the file indices count from 1, negative ones back from the `count` read so far; those ahead
+/// are checked when all is read.
+fn index(
+    reader: &LineReader,
+    word: &[u8],
+    digits: &[u8],
+    count: usize,
+    what: &str,
+    ahead: &mut Option<Ahead>,
+) -> Result<u32> {
+    let value = integer(reader, word, digits)?;
+    let absolute = if value < 0 { count as i64 + value } else { value - 1 };
+    if absolute < 0 || absolute >= i64::from(u32::MAX) {
+        let message = format!("{what} `{value}` of the {count} so far, which count from 1");
+        return Err(reader.error(ErrorKind::Invalid, word, message));
+    }
+    if absolute as usize >= count && ahead.is_none_or(|known| known.index < absolute as u64) {
+        let column = (word.as_ptr() as usize - reader.line().as_ptr() as usize) as u64 + 1;
+        *ahead = Some(Ahead { index: absolute as u64, line: reader.number, column });
+    }
+    Ok(absolute as u32)
+}
