@@ -95,7 +95,7 @@ fn split_with(
     in_memory: usize,
     progress: Progress,
 ) -> Result<BatchPlan> {
-    sweep(&options.scratch, "split-")?;
+    sweep(&options.scratch, "split-", ".tmp")?;
     let mut splitter = Splitter {
         folder: options.scratch.clone(),
         per_batch: options.points_per_batch_max as usize,
@@ -280,7 +280,7 @@ impl Splitter<'_> {
         let table: Vec<Record> = self.leaves.into_iter().map(|leaf| leaf.record).collect();
         let header =
             Header { points_per_batch_max: self.per_batch as u32, points: self.points_total, stream_points };
-        self.writer.finish(header, table)
+        self.writer.finish(header, &table)
     }
 }
 
