@@ -1,0 +1,371 @@
+//! The leaf: up to eight micropolygons as bit-packed lattice vertices.
+//!
+//! ```text
+//! byte 0  faces        u8       1 to 8
+//!      1  vertices     u8       1 to 32
+//!      2  bits         3 x u8   bits of a vertex coordinate, per axis, 0 to 30
+//!      5  shift        u8       coordinates are origin + (packed << shift)
+//!      6  flags        u8       1: indices are bytes, not nibbles; 2: extinctions follow; 4: round faces
+//!      7  short        u8       bit i: face i is a triangle (flat leaves) or a point (round leaves)
+//!      8  origin       3 x i32  lattice coordinates of the vertices' lower corner
+//!     20  indices      4 per face (2 in round leaves), nibbles or bytes
+//!         coordinates  per axis ceil(vertices * bits / 8) bytes, least significant bit first
+//!         extinctions  u16 per face, if flagged
+//!         radii        f32 per vertex in lattice steps, round leaves only
+//! ```
+//!
+//! Flat leaves hold triangles and quads, round leaves points (spheres) and lines (round cones). A triangle repeats
+//! its last index, a point its only one.
+
+use glam::IVec3;
+
+use super::node::LatticeBox;
+
+/// Faces of a leaf at most.
+pub const FACES_MAX: usize = 8;
+/// Vertices of a leaf at most.
+pub const VERTICES_MAX: usize = 32;
+/// Bits of a packed coordinate at most: lattice coordinates stay within ±2^29.
+pub const BITS_MAX: u8 = 30;
+/// Bytes before the indices.
+pub const HEADER_BYTES: usize = 20;
+/// Readable bytes a decoder may touch past a leaf's end.
+pub const READ_PAST_BYTES: usize = 64;
+
+const FLAG_BYTE_INDICES: u8 = 1;
+const FLAG_EXTINCTIONS: u8 = 2;
+const FLAG_ROUND: u8 = 4;
+
+/// Extinction of a fully opaque face.
+pub const OPAQUE: u16 = u16::MAX;
+
+/// Units of extinction per halving of transmittance.
+///
+/// Transmittances multiply; extinctions, their logarithms, add. As integers they add exactly in any order, so a
+/// ray's result does not depend on the order in which it meets things.
+pub const EXTINCTION_PER_OCTAVE: f32 = 4096.0;
+
+/// The extinction of an opacity from 0 to 1: `-4096 log2(1 - opacity)`; [`OPAQUE`] from 0.99998 up.
+pub fn extinction_from_opacity(opacity: f32) -> u16 {
+    let transmittance = f64::from(1.0 - opacity.clamp(0.0, 1.0));
+    let extinction = -f64::from(EXTINCTION_PER_OCTAVE) * transmittance.log2();
+    if extinction < 65_000.0 { extinction.round() as u16 } else { OPAQUE }
+}
+
+/// One face of a leaf as the builder gives it and the plain decoder returns it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Face {
+    /// Vertices, 1 to 4; unused ones repeat the last.
+    pub vertices: [IVec3; 4],
+    /// 1 point, 2 line, 3 triangle, 4 quad.
+    pub arity: u8,
+    /// Extinction, [`OPAQUE`] for a solid face.
+    pub extinction: u16,
+    /// Radii of the first two vertices in lattice steps; points and lines only.
+    pub radii: [f32; 2],
+}
+
+impl Face {
+    /// Whether it is a point or a line.
+    pub fn is_round(&self) -> bool {
+        self.arity <= 2
+    }
+
+    /// Its box, radius included.
+    pub fn bounds(&self) -> LatticeBox {
+        let mut bounds = LatticeBox::EMPTY;
+        for (i, &vertex) in self.vertices[..usize::from(self.arity)].iter().enumerate() {
+            let radius = if self.is_round() { self.radii[i].ceil() as i32 } else { 0 };
+            bounds.add(vertex - radius);
+            bounds.add(vertex + radius);
+        }
+        bounds
+    }
+}
+
+/// The leaf's fixed part and where its columns lie.
+#[derive(Clone, Copy, Debug)]
+pub struct Layout {
+    /// Faces.
+    pub faces: usize,
+    /// Vertices.
+    pub vertices: usize,
+    /// Bits of a coordinate per axis.
+    pub bits: [u8; 3],
+    /// Left shift of packed coordinates.
+    pub shift: u8,
+    /// Whether indices take a byte each.
+    pub byte_indices: bool,
+    /// Whether every face is opaque.
+    pub opaque: bool,
+    /// Whether faces are points and lines.
+    pub round: bool,
+    /// Bit i: face i is a triangle, or a point.
+    pub short: u8,
+    /// Lower corner of the vertices.
+    pub origin: IVec3,
+    /// Byte offsets of the coordinates, per axis.
+    pub coordinates: [usize; 3],
+    /// Byte offset of the extinctions.
+    pub extinctions: usize,
+    /// Byte offset of the radii.
+    pub radii: usize,
+    /// Bytes of the leaf, padded to 8.
+    pub bytes: usize,
+}
+
+impl Layout {
+    /// Reads the fixed part; none if it promises what cannot be. `leaf` starts at the leaf and may run on.
+    #[inline(always)]
+    pub fn read(leaf: &[u8]) -> Option<Self> {
+        if leaf.len() < HEADER_BYTES {
+            return None;
+        }
+        let layout = Self::read_trusted(leaf);
+        let sane = (1..=FACES_MAX).contains(&layout.faces)
+            && (1..=VERTICES_MAX).contains(&layout.vertices)
+            && layout.bits.iter().all(|&bits| bits <= BITS_MAX)
+            && u32::from(layout.shift) <= 29
+            && leaf[6] <= 7
+            && layout.bytes <= leaf.len();
+        sane.then_some(layout)
+    }
+
+    /// [`read`](Self::read) for a leaf that was checked when its brick was loaded.
+    #[inline(always)]
+    pub fn read_trusted(leaf: &[u8]) -> Self {
+        let word = |at: usize| i32::from_le_bytes(leaf[at..at + 4].try_into().expect("4 bytes"));
+        let (faces, vertices, flags) = (usize::from(leaf[0]), usize::from(leaf[1]), leaf[6]);
+        let bits = [leaf[2], leaf[3], leaf[4]];
+        let (byte_indices, round) = (flags & FLAG_BYTE_INDICES != 0, flags & FLAG_ROUND != 0);
+        let index_count = faces * if round { 2 } else { 4 };
+        let mut at = HEADER_BYTES + if byte_indices { index_count } else { index_count / 2 };
+        let coordinates = bits.map(|bits| {
+            let here = at;
+            at += (vertices * usize::from(bits)).div_ceil(8);
+            here
+        });
+        let extinctions = at;
+        let opaque = flags & FLAG_EXTINCTIONS == 0;
+        at += if opaque { 0 } else { 2 * faces };
+        let radii = at;
+        at += if round { 4 * vertices } else { 0 };
+        Self {
+            faces,
+            vertices,
+            bits,
+            shift: leaf[5],
+            byte_indices,
+            opaque,
+            round,
+            short: leaf[7],
+            origin: IVec3::new(word(8), word(12), word(16)),
+            coordinates,
+            extinctions,
+            radii,
+            bytes: at.next_multiple_of(8),
+        }
+    }
+
+    /// The vertex index of corner `corner` of face `face`.
+    #[inline(always)]
+    pub fn index(&self, leaf: &[u8], face: usize, corner: usize) -> usize {
+        let at = face * if self.round { 2 } else { 4 } + corner;
+        usize::from(if self.byte_indices {
+            leaf[HEADER_BYTES + at]
+        } else {
+            leaf[HEADER_BYTES + at / 2] >> (4 * (at & 1)) & 15
+        })
+    }
+
+    /// The extinction of a face.
+    #[inline(always)]
+    pub fn extinction(&self, leaf: &[u8], face: usize) -> u16 {
+        if self.opaque {
+            return OPAQUE;
+        }
+        let at = self.extinctions + 2 * face;
+        u16::from_le_bytes([leaf[at], leaf[at + 1]])
+    }
+
+    /// The lattice coordinates of a vertex. `leaf` must run at least 8 bytes past the leaf's end.
+    #[inline(always)]
+    pub fn vertex(&self, leaf: &[u8], vertex: usize) -> IVec3 {
+        let axis = |axis: usize| {
+            let bit = vertex * usize::from(self.bits[axis]);
+            let at = self.coordinates[axis] + bit / 8;
+            let word = u64::from_le_bytes(leaf[at..at + 8].try_into().expect("8 bytes"));
+            let packed = (word >> (bit % 8)) as u32 & ((1_u32 << self.bits[axis]) - 1);
+            (packed << self.shift) as i32
+        };
+        IVec3::new(
+            self.origin.x.wrapping_add(axis(0)),
+            self.origin.y.wrapping_add(axis(1)),
+            self.origin.z.wrapping_add(axis(2)),
+        )
+    }
+
+    /// The radius of a vertex in lattice steps.
+    #[inline(always)]
+    pub fn radius(&self, leaf: &[u8], vertex: usize) -> f32 {
+        let at = self.radii + 4 * vertex;
+        f32::from_le_bytes(leaf[at..at + 4].try_into().expect("4 bytes"))
+    }
+
+    /// A face, decoded plainly. `leaf` must run at least 8 bytes past the leaf's end.
+    pub fn face(&self, leaf: &[u8], face: usize) -> Face {
+        let corners = if self.round { 2 } else { 4 };
+        let indices: [usize; 4] =
+            std::array::from_fn(|corner| self.index(leaf, face, corner.min(corners - 1)));
+        let short = self.short >> face & 1 != 0;
+        Face {
+            vertices: indices.map(|index| self.vertex(leaf, index)),
+            arity: corners as u8 - u8::from(short),
+            extinction: self.extinction(leaf, face),
+            radii: if self.round { [0, 1].map(|i| self.radius(leaf, indices[i])) } else { [0.0; 2] },
+        }
+    }
+
+    /// Whether indices and radii are such that decoding cannot fail. Checked once, when a brick is loaded.
+    pub fn is_sound(&self, leaf: &[u8]) -> bool {
+        let corners = if self.round { 2 } else { 4 };
+        let indices =
+            (0..self.faces).all(|face| (0..corners).all(|c| self.index(leaf, face, c) < self.vertices));
+        let radii = !self.round || (0..self.vertices).all(|v| (0.0..1e9).contains(&self.radius(leaf, v)));
+        indices && radii
+    }
+}
+
+/// Appends a leaf of `faces` (1 to 8, all flat or all round) to `out`, padded to 8 bytes. `shift` is that of the
+/// faces' geometry: all coordinates are congruent modulo `2^shift` and lie within
+/// [`COORDINATE_MAX`](super::lattice::COORDINATE_MAX).
+pub fn encode(faces: &[Face], shift: u8, out: &mut Vec<u8>) {
+    debug_assert!((1..=FACES_MAX).contains(&faces.len()));
+    let round = faces[0].is_round();
+    let corners = if round { 2 } else { 4 };
+
+    // Number the distinct vertices
+    let mut vertices = [(IVec3::ZERO, 0.0_f32); VERTICES_MAX];
+    let mut count = 0;
+    let mut indices = [0_u8; 4 * FACES_MAX];
+    for (f, face) in faces.iter().enumerate() {
+        debug_assert_eq!(face.is_round(), round);
+        for corner in 0..corners {
+            let used = corner.min(usize::from(face.arity) - 1);
+            let radius = if round { face.radii[used] } else { 0.0 };
+            let vertex = (face.vertices[used], radius);
+            let known = vertices[..count].iter().position(|v| *v == vertex);
+            let index = known.unwrap_or_else(|| {
+                vertices[count] = vertex;
+                count += 1;
+                count - 1
+            });
+            indices[f * corners + corner] = index as u8;
+        }
+    }
+
+    // Find the widths
+    let positions = || vertices[..count].iter().map(|v| v.0);
+    let origin = positions().fold(IVec3::MAX, IVec3::min);
+    let extent = (positions().fold(IVec3::MIN, IVec3::max) - origin) >> i32::from(shift);
+    let bits = extent.to_array().map(|extent| (32 - extent.leading_zeros()) as u8);
+    debug_assert!(bits.iter().all(|&bits| bits <= BITS_MAX));
+
+    // Write the fixed part and the indices
+    let start = out.len();
+    let byte_indices = count > 16;
+    let opaque = faces.iter().all(|face| face.extinction == OPAQUE);
+    let flags = u8::from(byte_indices) * FLAG_BYTE_INDICES
+        | u8::from(!opaque) * FLAG_EXTINCTIONS
+        | u8::from(round) * FLAG_ROUND;
+    let short_arity = corners as u8 - 1;
+    let short = faces.iter().enumerate().fold(0, |mask, (i, f)| mask | u8::from(f.arity == short_arity) << i);
+    out.extend_from_slice(&[faces.len() as u8, count as u8, bits[0], bits[1], bits[2], shift, flags, short]);
+    origin.to_array().iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
+    let indices = &indices[..faces.len() * corners];
+    if byte_indices {
+        out.extend_from_slice(indices);
+    } else {
+        out.extend(indices.chunks_exact(2).map(|pair| pair[0] | pair[1] << 4));
+    }
+
+    // Pack the coordinates
+    for axis in 0..3 {
+        let (mut word, mut filled) = (0_u64, 0);
+        for position in positions() {
+            word |= (((position[axis] - origin[axis]) >> shift) as u64) << filled;
+            filled += u32::from(bits[axis]);
+            while filled >= 8 {
+                out.push(word as u8);
+                word >>= 8;
+                filled -= 8;
+            }
+        }
+        if filled > 0 {
+            out.push(word as u8);
+        }
+    }
+    if !opaque {
+        faces.iter().for_each(|face| out.extend_from_slice(&face.extinction.to_le_bytes()));
+    }
+    if round {
+        vertices[..count].iter().for_each(|v| out.extend_from_slice(&v.1.to_le_bytes()));
+    }
+    out.resize(start + (out.len() - start).next_multiple_of(8), 0);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::hash::hash32;
+
+    fn random_face(seed: &mut u32, arity: u8, extent: u32, shift: u8) -> Face {
+        let mut next = || {
+            *seed = hash32(*seed);
+            *seed
+        };
+        let mut vertices: [IVec3; 4] = std::array::from_fn(|_| {
+            IVec3::from_array(std::array::from_fn(|_| ((next() % extent) << shift) as i32))
+        });
+        for i in usize::from(arity)..4 {
+            vertices[i] = vertices[usize::from(arity) - 1];
+        }
+        let extinction = if next() % 2 == 0 { OPAQUE } else { (next() % 60_000) as u16 };
+        let radii = if arity > 2 { [0.0; 2] } else { [1.5, if arity == 1 { 1.5 } else { 0.25 }] };
+        Face { vertices, arity, extinction, radii }
+    }
+
+    /// Catches any bit lost between encoding and the plain decoder: vertices must stay exact.
+    #[test]
+    fn leaves_round_trip() {
+        let mut seed = 7;
+        for case in 0..2000_u32 {
+            let round = case % 3 == 0;
+            let (shift, extent) = ((case % 4) as u8, [1, 3, 300, 1 << 20][case as usize % 4]);
+            let count = 1 + case as usize % FACES_MAX;
+            let faces: Vec<Face> = (0..count)
+                .map(|i| {
+                    let arity = (if round { 1 } else { 3 }) + ((i as u32 + case) % 2) as u8;
+                    random_face(&mut seed, arity, extent, shift)
+                })
+                .collect();
+            let mut bytes = Vec::new();
+            encode(&faces, shift, &mut bytes);
+            bytes.resize(bytes.len() + READ_PAST_BYTES, 0);
+            let layout = Layout::read(&bytes).unwrap();
+            assert!(layout.is_sound(&bytes));
+            assert_eq!(layout.bytes + READ_PAST_BYTES, bytes.len());
+            let decoded: Vec<Face> = (0..count).map(|i| layout.face(&bytes, i)).collect();
+            assert_eq!(decoded, faces, "case {case}");
+        }
+    }
+
+    /// Catches extinction that does not multiply as opacity does.
+    #[test]
+    fn extinctions_add_as_transmittances_multiply() {
+        assert_eq!(extinction_from_opacity(0.5), 4096);
+        assert_eq!(extinction_from_opacity(0.75), 8192);
+        assert_eq!(extinction_from_opacity(0.0), 0);
+        assert_eq!(extinction_from_opacity(1.0), OPAQUE);
+    }
+}
