@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::batch::{BitSet, RAYS_PER_BATCH_MAX};
 use crate::stream::schema::ATTRIBUTES_MAX;
 use crate::stream::{Attribute, Rate, Schema, ValueType};
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
 
 const MAGIC: &[u8; 8] = b"PNTRPART";
 const VERSION: u32 = 1;
@@ -36,7 +36,7 @@ impl PartFormat {
     /// other. `bake` is a hash of everything that the results depend on: parts of another bake are refused.
     ///
     /// # Errors
-    /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) when there is no attribute, one is not per vertex or not possible in a stream, or
+    /// [`ErrorKind::Invalid`] when there is no attribute, one is not per vertex or not possible in a stream, or
     /// `points_max` is not from 1 to 2^20.
     pub fn new(bake: u64, attributes: &[Attribute], points_max: u32) -> Result<Self> {
         if attributes.is_empty() {
@@ -144,7 +144,7 @@ impl Part {
     /// Checks that lengths agree with the format and that every computed value is a finite number.
     ///
     /// # Errors
-    /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) with batch, point and attribute.
+    /// [`ErrorKind::Invalid`] with batch, point and attribute.
     pub fn check(&self, format: &PartFormat) -> Result<()> {
         let points = self.indices.len();
         let batch = self.batch;
@@ -178,7 +178,7 @@ impl Part {
     /// Appends the part as an object to `out`, points sorted by index.
     ///
     /// # Errors
-    /// What [`check`](Self::check) finds; [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) when a point is there twice.
+    /// What [`check`](Self::check) finds; [`ErrorKind::Invalid`] when a point is there twice.
     pub fn encode(&self, format: &PartFormat, out: &mut Vec<u8>) -> Result<()> {
         self.check(format)?;
         let mut order: Vec<u32> = (0..self.indices.len() as u32).collect();
@@ -238,8 +238,8 @@ impl Part {
     /// Becomes the part that `bytes` hold; keeps its memory. `path` and `offset` say where they came from.
     ///
     /// # Errors
-    /// [`ErrorKind::Corrupt`](crate::ErrorKind::Corrupt) with the byte for damage, [`ErrorKind::Unsupported`] for another version,
-    /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) for a part of another bake. The part is empty then.
+    /// [`ErrorKind::Corrupt`] with the byte for damage, [`ErrorKind::Unsupported`] for another version,
+    /// [`ErrorKind::Invalid`] for a part of another bake. The part is empty then.
     pub fn decode(&mut self, bytes: &[u8], format: &PartFormat, path: &Path, offset: u64) -> Result<()> {
         *self = Self {
             indices: std::mem::take(&mut self.indices),
@@ -302,7 +302,7 @@ impl PartHeader {
     /// Reads the header of an encoded part and checks magic, version, checksum and lengths.
     ///
     /// # Errors
-    /// [`ErrorKind::Corrupt`](crate::ErrorKind::Corrupt) with the byte for damage, [`ErrorKind::Unsupported`] for another version.
+    /// [`ErrorKind::Corrupt`] with the byte for damage, [`ErrorKind::Unsupported`] for another version.
     pub fn decode(bytes: &[u8], path: &Path, offset: u64) -> Result<Self> {
         let corrupt = |at: usize, message: &str| Error::corrupt(path, offset + at as u64, message);
         if bytes.len() < HEADER_BYTES + 8 {
@@ -315,7 +315,7 @@ impl PartHeader {
         let u64_at = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("8 bytes"));
         if u32_at(8) != VERSION {
             let message = format!("version {} of a batch part, {VERSION} wanted", u32_at(8));
-            return Err(Error::unsupported(message).at_byte(path, offset + 8));
+            return Err(Error::new(ErrorKind::Unsupported, message).at_byte(path, offset + 8));
         }
         let checksum_at = bytes.len() - 8;
         if xxh3_64(&bytes[..checksum_at]) != u64_at(checksum_at) {
@@ -445,7 +445,6 @@ fn all_finite(value_type: ValueType, bytes: &[u8]) -> bool {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::ErrorKind;
     use proptest::prelude::*;
 
     /// A format with a single, a half and a byte attribute: 15 bytes a row.

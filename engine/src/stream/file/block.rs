@@ -1,4 +1,4 @@
-//! The layout of a block: its 64-byte header, its maxima, and columns as byte planes.
+//! The layout of a block: its 64-byte header, its maxima and the sizes that follow from a schema.
 
 use std::path::Path;
 
@@ -169,36 +169,5 @@ impl BlockHeader {
     /// Bytes of the two frames together.
     pub fn stored_bytes(&self) -> u64 {
         u64::from(self.summary_bytes[1]) + u64::from(self.payload_bytes[1])
-    }
-}
-
-/// Writes values of `width` bytes as `width` planes: all first bytes, then all second bytes and so on.
-pub(super) fn to_planes(values: &[u8], width: usize, out: &mut Vec<u8>) {
-    match width {
-        1 => out.extend_from_slice(values),
-        _ => (0..width).for_each(|plane| out.extend(values.iter().skip(plane).step_by(width))),
-    }
-}
-
-/// The inverse of [`to_planes`]; `out` is as long as `planes`.
-pub(super) fn from_planes(planes: &[u8], width: usize, out: &mut [u8]) {
-    let count = planes.len() / width;
-    match width {
-        4 => {
-            let (a, rest) = planes.split_at(count);
-            let (b, rest) = rest.split_at(count);
-            let (c, d) = rest.split_at(count);
-            let bytes = a.iter().zip(b).zip(c).zip(d);
-            for (value, (((&a, &b), &c), &d)) in out.as_chunks_mut::<4>().0.iter_mut().zip(bytes) {
-                *value = [a, b, c, d];
-            }
-        }
-        2 => {
-            let (a, b) = planes.split_at(count);
-            for (value, (&a, &b)) in out.as_chunks_mut::<2>().0.iter_mut().zip(a.iter().zip(b)) {
-                *value = [a, b];
-            }
-        }
-        _ => out.copy_from_slice(planes),
     }
 }

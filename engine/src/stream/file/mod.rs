@@ -55,7 +55,7 @@ macro_rules! read_le {
         )
     };
 }
-pub(self) use read_le;
+use read_le;
 
 #[cfg(test)]
 mod tests;

@@ -12,8 +12,11 @@ use super::footer::{self, Footer};
 use super::header::{self, Header};
 use super::{StreamCounts, read_le};
 use crate::stream::microgrid::FACES_MAX;
-use crate::stream::{Microgrid, MicrogridStream, Schema};
+use crate::stream::{Microgrid, MicrogridStream, Rate, Schema};
 use crate::{Error, ErrorKind, Result};
+
+/// The exponent bits of an f32; all set in infinities and NaNs.
+const EXPONENT: u32 = 0x7f80_0000;
 
 /// Reads a `.mgs` file. Memory is bounded by the format's maxima whatever the file claims: about 30 MiB at the very
 /// worst, 4 MiB for what [`MgsWriter`](super::MgsWriter) writes.
@@ -68,8 +71,8 @@ struct Block {
     has_payload: bool,
     summary: Vec<u8>,
     payload: Vec<u8>,
-    positions: Vec<Vec3>,
-    columns: Vec<Vec<u8>>,
+    /// Where each attribute's column begins in the payload.
+    columns: Vec<usize>,
     grid: usize,
     vertex: usize,
     face: usize,
@@ -108,7 +111,6 @@ impl MgsReader {
         file.seek(SeekFrom::Start(footer_offset)).map_err(io)?;
         file.read_exact(&mut bytes).map_err(io)?;
         let footer = Footer::decode(&bytes, footer_offset, seed, path)?;
-        let columns = vec![Vec::new(); header.schema.attributes.len()];
         let mut reader = Self {
             path: path.to_path_buf(),
             file,
@@ -121,7 +123,7 @@ impl MgsReader {
             offset: 0,
             counted: Footer::default(),
             state: State::Reading,
-            block: Block { columns, ..Block::default() },
+            block: Block::default(),
             stored: Vec::new(),
         };
         reader.rewind()?;
@@ -235,7 +237,7 @@ impl MgsReader {
         let block = &self.block;
         self.read_frame(block.payload_offset, block.payload_frame, block.payload_checksum, &mut payload)?;
         self.block.payload = payload;
-        self.block.decode_payload(&self.header.schema, &self.path)
+        self.block.open_payload(&self.header.schema, &self.path)
     }
 
     fn read_at(&mut self, offset: u64, bytes: &mut [u8]) -> Result<()> {
@@ -273,7 +275,7 @@ impl MgsReader {
         let faces = block.face..block.face + summary.faces as usize;
         block.face = faces.end;
         if block.has_payload {
-            block.corner += block.payload[faces].iter().map(|&arity| usize::from(arity)).sum::<usize>();
+            block.corner += corners_of(&block.payload[faces]);
         }
         Ok(summary)
     }
@@ -340,10 +342,10 @@ impl Block {
     fn summary_of(&self, grid: usize) -> GridSummary {
         let [middles, vertex_counts, face_counts] = block::summary_columns(self.grids);
         let anchor = std::array::from_fn(|i| read_le!(f64, self.summary, 24 * grid + 8 * i));
-        let middle = std::array::from_fn(|i| read_le!(f32, self.summary, middles + 12 * grid + 4 * i));
+        let middle = middles + 12 * grid;
         GridSummary {
             anchor: DVec3::from_array(anchor),
-            middle: Vec3::from_array(middle),
+            middle: vec3(self.summary[middle..middle + 12].as_array().expect("12 bytes")),
             vertices: u32::from(self.summary[vertex_counts + grid]) + 1,
             faces: u32::from(read_le!(u16, self.summary, face_counts + 2 * grid)),
         }
@@ -373,36 +375,33 @@ impl Block {
         Ok(())
     }
 
-    /// Turns planes into columns and checks arities and positions of the whole block at once, which vectorises.
-    fn decode_payload(&mut self, schema: &Schema, path: &Path) -> Result<()> {
+    /// Finds the columns and checks arities and positions of the whole block at once, which vectorises.
+    fn open_payload(&mut self, schema: &Schema, path: &Path) -> Result<()> {
         let arities = &self.payload[..self.faces];
         let legal = arities.iter().fold(true, |legal, arity| legal & (1..=4).contains(arity));
-        let corners: usize = arities.iter().map(|&arity| usize::from(arity)).sum();
-        if !legal || corners != self.corners {
+        if !legal || corners_of(arities) != self.corners {
             return Err(Error::corrupt(path, self.payload_offset, "a block's faces do not add up"));
         }
-        let mut rest = &self.payload[self.faces + self.corners..];
-        let positions;
-        (positions, rest) = rest.split_at(12 * self.vertices);
-        self.positions.resize(self.vertices, Vec3::ZERO);
-        block::from_planes(positions, 4, bytemuck::cast_slice_mut(&mut self.positions));
-        let finite = bytemuck::cast_slice::<Vec3, f32>(&self.positions)
-            .iter()
-            .fold(true, |finite, x| finite & (x.to_bits() & 0x7f80_0000 != 0x7f80_0000));
-        for (attribute, column) in schema.attributes.iter().zip(&mut self.columns) {
-            let values =
-                if attribute.rate == crate::stream::Rate::Vertex { self.vertices } else { self.grids };
-            let planes;
-            (planes, rest) = rest.split_at(values * attribute.value_bytes());
-            column.resize(planes.len(), 0);
-            block::from_planes(planes, attribute.value_type.bytes(), column);
-        }
-        if !finite {
+        let positions = &self.payload[self.positions_at(0)..self.positions_at(self.vertices)];
+        let exponents = positions.as_chunks::<4>().0.iter().map(|&x| u32::from_le_bytes(x) & EXPONENT);
+        if !exponents.fold(true, |finite, exponent| finite & (exponent != EXPONENT)) {
             return Err(Error::corrupt(path, self.payload_offset, "a position is not a finite number"));
         }
-        self.corner = self.payload[..self.face].iter().map(|&arity| usize::from(arity)).sum();
+        let mut at = self.positions_at(self.vertices);
+        self.columns.clear();
+        for attribute in &schema.attributes {
+            self.columns.push(at);
+            at += attribute.value_bytes()
+                * if attribute.rate == Rate::Vertex { self.vertices } else { self.grids };
+        }
+        self.corner = corners_of(&self.payload[..self.face]);
         self.has_payload = true;
         Ok(())
+    }
+
+    /// Where the position of a vertex of the block begins in the payload.
+    fn positions_at(&self, vertex: usize) -> usize {
+        self.faces + self.corners + 12 * vertex
     }
 
     /// Copies the next grid out of the columns and checks its indices.
@@ -410,35 +409,34 @@ impl Block {
         let summary = self.summary_of(self.grid);
         let (vertices, faces) = (summary.vertices as usize, summary.faces as usize);
         let arities = &self.payload[self.face..self.face + faces];
-        let corners: usize = arities.iter().map(|&arity| usize::from(arity)).sum();
+        let corners = corners_of(arities);
         let indices = &self.payload[self.faces + self.corner..][..corners];
-        let positions = &self.positions[self.vertex..self.vertex + vertices];
+        let positions =
+            &self.payload[self.positions_at(self.vertex)..self.positions_at(self.vertex + vertices)];
         let highest = indices.iter().fold(0, |highest, &index| index.max(highest));
         if usize::from(highest) >= vertices {
             let what = format!("has {vertices} vertices and a face index {highest}");
             return Err(self.broken(path, self.grid, &what));
         }
-        if positions[vertices / 2] != summary.middle {
+        grid.clear(schema.attributes.len());
+        grid.anchor = summary.anchor;
+        grid.positions.extend(positions.as_chunks::<12>().0.iter().map(vec3));
+        if grid.positions[vertices / 2] != summary.middle {
             return Err(self.broken(
                 path,
                 self.grid,
                 "has a middle vertex that is not the one of its summary",
             ));
         }
-        grid.clear(schema.attributes.len());
-        grid.anchor = summary.anchor;
-        grid.positions.extend_from_slice(positions);
         grid.arities.extend_from_slice(arities);
         grid.indices.extend_from_slice(indices);
-        for ((attribute, values), column) in
-            schema.attributes.iter().zip(&self.columns).zip(&mut grid.columns)
-        {
-            let bytes = attribute.value_bytes();
-            let range = match attribute.rate {
-                crate::stream::Rate::Vertex => self.vertex * bytes..(self.vertex + vertices) * bytes,
-                crate::stream::Rate::Grid => self.grid * bytes..(self.grid + 1) * bytes,
+        for ((attribute, &at), column) in schema.attributes.iter().zip(&self.columns).zip(&mut grid.columns) {
+            let (first, count) = match attribute.rate {
+                Rate::Vertex => (self.vertex, vertices),
+                Rate::Grid => (self.grid, 1),
             };
-            column.extend_from_slice(&values[range]);
+            let bytes = attribute.value_bytes();
+            column.extend_from_slice(&self.payload[at + first * bytes..][..count * bytes]);
         }
         self.grid += 1;
         self.vertex += vertices;
@@ -459,4 +457,13 @@ impl Block {
     fn broken(&self, path: &Path, grid: usize, what: &str) -> Error {
         Error::corrupt(path, self.payload_offset, format!("grid {grid} of a block {what}"))
     }
+}
+
+/// The corners of faces of these arities. At most 4,096 in a grid and 8 Mi in a block.
+fn corners_of(arities: &[u8]) -> usize {
+    arities.iter().map(|&arity| u32::from(arity)).sum::<u32>() as usize
+}
+
+fn vec3(bytes: &[u8; 12]) -> Vec3 {
+    Vec3::from_array(std::array::from_fn(|i| read_le!(f32, bytes, 4 * i)))
 }

@@ -115,7 +115,7 @@ impl MgsWriter {
     }
 
     fn flush_block(&mut self) -> Result<()> {
-        let bytes = self.columns.encode(&self.schema, self.offset, self.seed, &mut self.scratch);
+        let bytes = self.columns.encode(self.offset, self.seed, &mut self.scratch);
         if let Err(error) = self.file.write_all(bytes) {
             self.failed = true;
             return Err(Error::io("write", self.file.target(), error));
@@ -162,7 +162,7 @@ impl BlockColumns {
     }
 
     /// The whole block as it stands in the file at `offset`.
-    fn encode<'a>(&self, schema: &Schema, offset: u64, seed: u64, scratch: &'a mut Scratch) -> &'a [u8] {
+    fn encode<'a>(&self, offset: u64, seed: u64, scratch: &'a mut Scratch) -> &'a [u8] {
         let Scratch { plain, block } = scratch;
         block.clear();
         block.resize(block::HEADER_BYTES, 0);
@@ -176,10 +176,8 @@ impl BlockColumns {
         plain.clear();
         plain.extend_from_slice(&self.arities);
         plain.extend_from_slice(&self.indices);
-        block::to_planes(&self.positions, 4, plain);
-        for (attribute, column) in schema.attributes.iter().zip(&self.attributes) {
-            block::to_planes(column, attribute.value_type.bytes(), plain);
-        }
+        plain.extend_from_slice(&self.positions);
+        self.attributes.iter().for_each(|column| plain.extend_from_slice(column));
         let (payload_bytes, payload_checksum) = append_frame(plain, block);
 
         let header = BlockHeader {
