@@ -45,7 +45,7 @@ const IN_MEMORY_POINTS_MAX: u64 = 1 << 25;
 const PARALLEL_POINTS_MIN: usize = 1 << 14;
 
 /// Points sorted and encoded in one go, to keep memory bounded and progress moving.
-const GROUP_POINTS: usize = 1 << 18;
+const GROUP_POINTS: usize = 1 << 17;
 
 /// The part of the work that reading the stream is taken for, in what progress reports.
 const GATHER_SHARE: f64 = 0.4;

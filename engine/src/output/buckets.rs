@@ -35,7 +35,8 @@ impl Division {
     /// [`ErrorKind::Limit`] when the memory is too small for so many points.
     pub fn new(points: u64, row_bytes: usize, memory_bytes: u64) -> Result<Self> {
         // A bit per point for the coverage, and no more than fits into the 32 bits of a place in a range
-        let range_points = (memory_bytes / 2 * 8 / (8 * row_bytes as u64 + 1)).min(1 << 31);
+        let range_points = u128::from(memory_bytes) * 4 / (8 * row_bytes as u128 + 1);
+        let range_points = range_points.min(1 << 31) as u64;
         let range_points = range_points.clamp(1, points.max(1));
         let ranges = points.div_ceil(range_points).max(1);
         let block_bytes = (memory_bytes / 4 / ranges).min(BLOCK_BYTES_MAX);
@@ -284,6 +285,7 @@ mod tests {
             (1_000_000, 36, 1 << 30),
             (1_000_000_000, 36, 64 << 20),
             (300_000_000, 600, 1 << 30),
+            (1 << 40, 1, u64::MAX),
         ] {
             let division = Division::new(points, row_bytes, memory_bytes).expect("a division");
             let ranges = division.ranges() as u64;

@@ -95,8 +95,8 @@ fn merge_with(
     let mut writer = MgsWriter::create(target, &schema, options.metadata)?;
     let mut decorator = Decorator { format: &format, marked, buckets, next: 0, report };
     decorator.pass(input, plan.stream_points(), &mut writer, progress)?;
-    writer.finish()?;
     progress(1.0)?;
+    writer.finish()?;
     Ok(decorator.report)
 }
 
