@@ -68,6 +68,28 @@ impl BitSet {
         let number = 64 * word as u64 + u64::from(self.words[word].trailing_ones());
         (number < self.len).then_some(number)
     }
+
+    /// Appends the members as bits, number `i` in bit `i % 8` of byte `i / 8`.
+    pub fn write_bytes(&self, out: &mut Vec<u8>) {
+        let bytes = self.words.iter().flat_map(|word| word.to_le_bytes());
+        out.extend(bytes.take(self.len.div_ceil(8) as usize));
+    }
+
+    /// Takes over the numbers below `len` that [`write_bytes`](Self::write_bytes) wrote. False, and an empty set, when
+    /// there are not as many bytes, or an unused bit of the last one is set.
+    pub fn read_bytes(&mut self, bytes: &[u8], len: u64) -> bool {
+        let sound = bytes.len() as u64 == len.div_ceil(8)
+            && (len.is_multiple_of(8) || bytes[bytes.len() - 1] >> (len % 8) == 0);
+        self.reset(if sound { len } else { 0 });
+        if sound {
+            for (word, bytes) in self.words.iter_mut().zip(bytes.chunks(8)) {
+                let mut whole = [0; 8];
+                whole[..bytes.len()].copy_from_slice(bytes);
+                *word = u64::from_le_bytes(whole);
+            }
+        }
+        sound
+    }
 }
 
 #[cfg(test)]
@@ -101,5 +123,24 @@ mod tests {
         assert_eq!(set.len(), 1000);
         set.reset(20);
         assert_eq!((set.count(), set.len()), (0, 20));
+    }
+
+    /// Catches members that move in their bytes, and bytes with more members than can be.
+    #[test]
+    fn bytes_hold_the_members_and_nothing_else() {
+        for len in [0, 1, 8, 9, 64, 130] {
+            let mut set = BitSet::new(len);
+            for number in (0..len).step_by(3) {
+                set.insert(number);
+            }
+            let mut bytes = Vec::new();
+            set.write_bytes(&mut bytes);
+            assert_eq!(bytes.len() as u64, len.div_ceil(8));
+            let mut read = BitSet::new(5);
+            assert!(read.read_bytes(&bytes, len) && read == set);
+            bytes.push(0);
+            assert!(!read.read_bytes(&bytes, len) && read.is_empty());
+        }
+        assert!(!BitSet::default().read_bytes(&[0b1000], 3));
     }
 }

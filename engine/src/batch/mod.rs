@@ -16,7 +16,7 @@ pub use bitset::BitSet;
 pub use filter::{GridMask, KeepAll, PointFilter};
 pub use hilbert::HilbertCurve;
 pub use plan::{BatchInfo, BatchPlan, evenly_spaced};
-pub(crate) use scratch::{ScratchFile, sync_folder};
+pub(crate) use scratch::{ScratchFile, sweep};
 pub use split::{Progress, SplitOptions, split};
 
 use glam::{DVec3, Vec3};

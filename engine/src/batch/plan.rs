@@ -12,8 +12,10 @@ use std::sync::{Mutex, PoisonError};
 use glam::DVec3;
 use xxhash_rust::xxh3::{Xxh3Default, xxh3_64};
 
-use super::{BitSet, Point, ScratchFile};
+use super::scratch::sweep;
+use super::{BitSet, Point};
 use crate::math::Bounds;
+use crate::stream::file::AtomicFile;
 use crate::{Error, ErrorKind, Result};
 
 const PLAN_FILE: &str = "plan.bin";
@@ -177,7 +179,7 @@ pub fn evenly_spaced(plan: &BatchPlan, points_max: u64) -> Vec<u32> {
 /// Writes the points file and then the table: the writing half of a plan.
 pub(super) struct PlanWriter {
     folder: PathBuf,
-    scratch: ScratchFile,
+    points: AtomicFile,
 }
 
 impl PlanWriter {
@@ -187,6 +189,7 @@ impl PlanWriter {
     /// When the operating system refuses.
     pub fn create(folder: &Path) -> Result<Self> {
         for name in [PLAN_FILE, POINTS_FILE] {
+            sweep(folder, &format!(".{name}."), ".partial")?;
             let path = folder.join(name);
             match fs::remove_file(&path) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
@@ -195,8 +198,8 @@ impl PlanWriter {
                 _ => {}
             }
         }
-        let scratch = ScratchFile::create(folder.join("split-points.tmp"))?;
-        let mut writer = Self { folder: folder.into(), scratch };
+        let points = AtomicFile::create(&folder.join(POINTS_FILE))?;
+        let mut writer = Self { folder: folder.into(), points };
         let mut header = POINTS_MAGIC.to_vec();
         header.extend_from_slice(&VERSION.to_le_bytes());
         header.extend_from_slice(&(Point::BYTES as u32).to_le_bytes());
@@ -209,41 +212,39 @@ impl PlanWriter {
     /// # Errors
     /// When the disk is full or refuses.
     pub fn append(&mut self, bytes: &[u8]) -> Result<()> {
-        let written = self.scratch.file.write_all(bytes);
-        written.map_err(|error| Error::io("write points", self.scratch.path(), error))
+        let written = self.points.write_all(bytes);
+        written.map_err(|error| Error::io("write points", self.points.target(), error))
     }
 
     /// Brings points and table to disk and gives both their names.
     ///
     /// # Errors
     /// When the operating system refuses.
-    pub fn finish(self, header: Header, table: Vec<Record>) -> Result<BatchPlan> {
-        self.scratch.persist(&self.folder.join(POINTS_FILE))?;
-        let scratch = ScratchFile::create(self.folder.join("split-plan.tmp"))?;
-        write_table(&scratch, &header, &table)?;
-        scratch.persist(&self.folder.join(PLAN_FILE))?;
+    pub fn finish(self, header: Header, table: &[Record]) -> Result<BatchPlan> {
+        self.points.commit()?;
+        let path = self.folder.join(PLAN_FILE);
+        let mut file = AtomicFile::create(&path)?;
+        write_table(&mut file, &header, table).map_err(|error| Error::io("write the plan", &path, error))?;
+        file.commit()?;
         BatchPlan::open(&self.folder)
     }
 }
 
-fn write_table(scratch: &ScratchFile, header: &Header, table: &[Record]) -> Result<()> {
-    let mut out = HashingWriter { out: BufWriter::new(&scratch.file), hash: Xxh3Default::new() };
-    let written = (|| {
-        out.put(PLAN_MAGIC)?;
-        out.put(&VERSION.to_le_bytes())?;
-        out.put(&header.points_per_batch_max.to_le_bytes())?;
-        out.put(&header.points.to_le_bytes())?;
-        out.put(&header.stream_points.to_le_bytes())?;
-        out.put(&(table.len() as u32).to_le_bytes())?;
-        out.put(&[0; 4])?;
-        for record in table {
-            out.put(&record.to_bytes())?;
-        }
-        let hash = out.hash.digest();
-        out.out.write_all(&hash.to_le_bytes())?;
-        out.out.flush()
-    })();
-    written.map_err(|error: std::io::Error| Error::io("write the plan", scratch.path(), error))
+fn write_table(file: &mut AtomicFile, header: &Header, table: &[Record]) -> std::io::Result<()> {
+    let mut out = HashingWriter { out: BufWriter::new(file), hash: Xxh3Default::new() };
+    out.put(PLAN_MAGIC)?;
+    out.put(&VERSION.to_le_bytes())?;
+    out.put(&header.points_per_batch_max.to_le_bytes())?;
+    out.put(&header.points.to_le_bytes())?;
+    out.put(&header.stream_points.to_le_bytes())?;
+    out.put(&(table.len() as u32).to_le_bytes())?;
+    out.put(&[0; 4])?;
+    for record in table {
+        out.put(&record.to_bytes())?;
+    }
+    let hash = out.hash.digest();
+    out.out.write_all(&hash.to_le_bytes())?;
+    out.out.flush()
 }
 
 /// A writer that hashes what passes.

@@ -34,52 +34,25 @@ impl ScratchFile {
     pub fn path(&self) -> &Path {
         &self.path
     }
-
-    /// Gives the file its final name: on disk first, then renamed, then the folder's entry on disk.
-    ///
-    /// # Errors
-    /// When the operating system refuses; the temporary file is gone then.
-    pub fn persist(self, target: &Path) -> Result<()> {
-        self.file.sync_all().map_err(|error| Error::io("write to disk", &self.path, error))?;
-        fs::rename(&self.path, target).map_err(|error| Error::io("rename to", target, error))?;
-        sync_folder(target)
-    }
 }
 
 impl Drop for ScratchFile {
     fn drop(&mut self) {
-        // After `persist` there is nothing under this name; a file that cannot be removed is swept by the next run.
+        // A file that cannot be removed now is swept by the next run.
         let _ = fs::remove_file(&self.path);
     }
 }
 
-/// Brings the entry of `path` in its folder to disk.
-///
-/// # Errors
-/// When the operating system refuses.
-pub fn sync_folder(path: &Path) -> Result<()> {
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    // Only Unix lets a folder be opened and synchronised; elsewhere the rename alone has to do.
-    if cfg!(unix) {
-        let synced = File::open(folder).and_then(|folder| folder.sync_all());
-        synced.map_err(|error| Error::io("write the folder to disk", folder, error))?;
-    }
-    Ok(())
-}
-
-/// Removes the files in `folder` that a killed run left: those whose names start with `prefix` and end in `.tmp`.
+/// Removes the files in `folder` that a killed run left: those whose names start with `prefix` and end in `suffix`.
 ///
 /// # Errors
 /// When the folder cannot be read or a file cannot be removed.
-pub fn sweep(folder: &Path, prefix: &str) -> Result<()> {
+pub fn sweep(folder: &Path, prefix: &str, suffix: &str) -> Result<()> {
     let entries = fs::read_dir(folder).map_err(|error| Error::io("read the folder", folder, error))?;
     for entry in entries {
         let entry = entry.map_err(|error| Error::io("read the folder", folder, error))?;
         let name = entry.file_name();
-        if name.to_str().is_some_and(|name| name.starts_with(prefix) && name.ends_with(".tmp")) {
+        if name.to_str().is_some_and(|name| name.starts_with(prefix) && name.ends_with(suffix)) {
             let path = entry.path();
             fs::remove_file(&path).map_err(|error| Error::io("remove the stale file", &path, error))?;
         }
@@ -206,7 +179,7 @@ mod tests {
         for name in ["split-7.tmp", "split-7.bin", "plan.bin", "other.tmp"] {
             fs::write(folder.path().join(name), b"x").expect("written");
         }
-        sweep(folder.path(), "split-").expect("swept");
+        sweep(folder.path(), "split-", ".tmp").expect("swept");
         let mut left: Vec<_> =
             fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         left.sort();

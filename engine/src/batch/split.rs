@@ -45,7 +45,7 @@ const IN_MEMORY_POINTS_MAX: u64 = 1 << 25;
 const PARALLEL_POINTS_MIN: usize = 1 << 14;
 
 /// Points sorted and encoded in one go, to keep memory bounded and progress moving.
-const GROUP_POINTS: usize = 1 << 18;
+const GROUP_POINTS: usize = 1 << 17;
 
 /// The part of the work that reading the stream is taken for, in what progress reports.
 const GATHER_SHARE: f64 = 0.4;
@@ -95,7 +95,7 @@ fn split_with(
     in_memory: usize,
     progress: Progress,
 ) -> Result<BatchPlan> {
-    sweep(&options.scratch, "split-")?;
+    sweep(&options.scratch, "split-", ".tmp")?;
     let mut splitter = Splitter {
         folder: options.scratch.clone(),
         per_batch: options.points_per_batch_max as usize,
@@ -280,7 +280,7 @@ impl Splitter<'_> {
         let table: Vec<Record> = self.leaves.into_iter().map(|leaf| leaf.record).collect();
         let header =
             Header { points_per_batch_max: self.per_batch as u32, points: self.points_total, stream_points };
-        self.writer.finish(header, table)
+        self.writer.finish(header, &table)
     }
 }
 
