@@ -1,0 +1,217 @@
+//! Procedural streams: a jungle around a clearing, a meadow, bare ground (`docs/procedural.md`).
+//!
+//! The generator plans a world without end from hashes of whole numbers ([`terrain`], [`scatter`]) and shows a square
+//! of it, patch by patch in Hilbert order. A plant is first planned as a list of parts ([`plant`], [`tree`], [`frond`],
+//! [`herb`]); each part is then drawn into one microgrid ([`leaf`], [`wood`], [`pen`]). Only the current patch and the
+//! current plan are held, whatever the stream's size. All arithmetic is IEEE additions, products, quotients and square
+//! roots, so the bytes are the same on every machine.
+
+mod extent;
+mod frond;
+mod herb;
+mod hilbert;
+mod leaf;
+mod noise;
+mod pen;
+mod plant;
+mod scatter;
+mod terrain;
+mod tree;
+mod trig;
+mod wood;
+
+#[cfg(test)]
+mod tests;
+
+use glam::{DMat4, DVec3, Vec3};
+
+use crate::math::hash::combine;
+use crate::scene::{Procedural, ProceduralKind};
+use crate::stream::schema::{Schema, UpAxis};
+use crate::stream::{Microgrid, MicrogridStream};
+use crate::{Error, Result};
+
+use extent::{Extent, World};
+use noise::{Rng, noise};
+use pen::{Paint, Pen, Space};
+use plant::{Part, Plan, Site};
+use terrain::Patch;
+
+/// Micropolygons that can be asked for at most.
+pub const MICROPOLYGONS_MAX: u64 = 1_000_000_000_000;
+
+/// A procedural stream: deterministic by seed, of any size, in constant memory.
+///
+/// Grids carry `N` (f32 × 3 per vertex, unit), `albedo` (f16 × 3 per grid, linear) and `id` (u32 per grid: 0 for the
+/// ground, then the plants' numbers in stream order). Faces are quads, counter-clockwise seen from where `N` points.
+#[derive(Clone, Debug)]
+pub struct ProceduralStream {
+    schema: Schema,
+    space: Space,
+    world: World,
+    extent: Extent,
+    cursor: Cursor,
+    pen: Pen,
+}
+
+/// How far the stream is, and the buffers of the patch and plant at hand.
+#[derive(Clone, Debug, Default)]
+struct Cursor {
+    /// The next place on the Hilbert curve over all patches.
+    place: u64,
+    patch: Patch,
+    /// Plants of the patch, and the next one to plan.
+    sites: Vec<Site>,
+    site: usize,
+    /// Parts of the plant, and the next one to draw.
+    plan: Plan,
+    part: usize,
+    /// Foot of the plant in metres.
+    foot: DVec3,
+    /// Plants so far.
+    plants: u32,
+}
+
+impl ProceduralStream {
+    /// A stream of about `parameters.micropolygons` (see `docs/procedural.md` for how near), in a scene of
+    /// `meters_per_unit` whose `up` axis points up.
+    ///
+    /// Takes up to about a second for large jungles: the square's size is fitted to the count.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) when the count is 0 or above [`MICROPOLYGONS_MAX`], or the
+    /// unit is not a positive number.
+    pub fn new(parameters: &Procedural, meters_per_unit: f64, up: UpAxis) -> Result<Self> {
+        let schema = pen::schema(meters_per_unit, up);
+        schema.validate()?;
+        let (world, extent) = fit(parameters)?;
+        let space = Space::new(meters_per_unit, up);
+        Ok(Self { schema, space, world, extent, cursor: Cursor::default(), pen: Pen::default() })
+    }
+
+    /// Goes to the next patch and draws its ground. False at the end.
+    fn next_patch(&mut self, grid: &mut Microgrid) -> bool {
+        let cursor = &mut self.cursor;
+        let Some(range) = self.extent.next_patch(&mut cursor.place) else {
+            return false;
+        };
+        self.world.ground.patch(range, &mut cursor.patch);
+        let [low, high] = self.extent.rectangle(&range);
+        self.world.scatter.plants(low, high, &mut cursor.sites);
+        cursor.site = 0;
+        self.pen.start();
+        let topology = cursor.patch.draw(&mut self.pen);
+        let paint = Paint { albedo: ground_albedo(&self.world, &cursor.patch), id: 0 };
+        self.pen.finish(grid, &self.space, cursor.patch.anchor(), topology, &paint);
+        true
+    }
+
+    /// Plans the next plant of the patch. False if there is none.
+    fn next_plant(&mut self) -> bool {
+        let cursor = &mut self.cursor;
+        let Some(site) = cursor.sites.get(cursor.site) else {
+            return false;
+        };
+        cursor.site += 1;
+        cursor.part = 0;
+        cursor.plants = cursor.plants.wrapping_add(1);
+        let height = cursor.patch.height(site.x, site.z);
+        let slope = [
+            (cursor.patch.height(site.x + 0.05, site.z) - height) * 20.0,
+            (cursor.patch.height(site.x, site.z + 0.05) - height) * 20.0,
+        ];
+        cursor.foot = Vec3::new(site.x, height, site.z).as_dvec3();
+        cursor.plan.grow(site, slope);
+        true
+    }
+}
+
+impl MicrogridStream for ProceduralStream {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn rewind(&mut self) -> Result<()> {
+        let Cursor { place, site, part, plants, .. } = &mut self.cursor;
+        (*place, *site, *part, *plants) = (0, 0, 0, 0);
+        self.cursor.sites.clear();
+        self.cursor.plan.parts.clear();
+        Ok(())
+    }
+
+    fn next(&mut self, grid: &mut Microgrid) -> Result<bool> {
+        loop {
+            if let Some(part) = self.cursor.plan.parts.get(self.cursor.part) {
+                self.cursor.part += 1;
+                let topology = Part::draw(part, &mut self.pen);
+                let paint = Paint { albedo: part.albedo, id: self.cursor.plants };
+                self.pen.finish(grid, &self.space, self.cursor.foot, topology, &paint);
+                return Ok(true);
+            }
+            if !self.next_plant() {
+                return Ok(self.next_patch(grid));
+            }
+        }
+    }
+
+    fn progress(&self) -> f64 {
+        self.extent.progress(self.cursor.place)
+    }
+}
+
+/// Where a camera for this stream should stand: world from camera (looking along its -z, +y up in the picture) in
+/// scene units, and the vertical field of view in degrees. The ground before it is free of tall plants.
+///
+/// # Errors
+/// As [`ProceduralStream::new`].
+pub fn demo_camera(parameters: &Procedural, meters_per_unit: f64, up: UpAxis) -> Result<(DMat4, f64)> {
+    pen::schema(meters_per_unit, up).validate()?;
+    let (world, _) = fit(parameters)?;
+    let stand = world.scatter.stand();
+    let at = |[x, z]: [f32; 2], above: f32| Vec3::new(x, world.ground.height(x, z) + above, z).as_dvec3();
+    let (eye, target) = (at(stand.foot, stand.eye), at(stand.target, stand.target_height));
+    let space = Space::new(meters_per_unit, up);
+    let vertical = space.point(DVec3::Y).normalize();
+    let eye = space.point(eye);
+    let back = (eye - space.point(target)).normalize();
+    let right = vertical.cross(back).normalize();
+    let columns = [right.extend(0.0), back.cross(right).extend(0.0), back.extend(0.0), eye.extend(1.0)];
+    let [x, y, z, w] = columns;
+    Ok((DMat4::from_cols(x, y, z, w), stand.fov_degrees))
+}
+
+/// The world of the parameters and the square of it that holds the count asked for.
+fn fit(parameters: &Procedural) -> Result<(World, Extent)> {
+    let count = parameters.micropolygons;
+    if count == 0 || count > MICROPOLYGONS_MAX {
+        let message = format!("a procedural stream of `{count}` micropolygons");
+        return Err(Error::invalid(message).hint(format!("1 to {MICROPOLYGONS_MAX} are possible")));
+    }
+    let seed = combine(parameters.seed as u32, (parameters.seed >> 32) as u32);
+    Ok(extent::fit(parameters.kind, seed, count))
+}
+
+/// The colour of the ground around the middle of a patch.
+fn ground_albedo(world: &World, patch: &Patch) -> Vec3 {
+    let [x, z] = [0, 1].map(|axis| {
+        (patch.range.first[axis] as f32 + 0.5 * patch.range.quads[axis] as f32) * world.ground.quad_meters
+    });
+    let (height, steepness) = patch.middle();
+    let drift = noise(world.seed ^ 0x5011, x * 0.031, z * 0.031)
+        + 0.5 * noise(world.seed ^ 0x5012, x * 0.12, z * 0.12);
+    let soil = match world.kind {
+        ProceduralKind::Jungle => Vec3::new(0.115, 0.082, 0.050) * (1.0 + 0.4 * drift),
+        ProceduralKind::Grass => Vec3::new(0.13, 0.125, 0.055) * (1.0 + 0.4 * drift),
+        ProceduralKind::Terrain => {
+            let grass = Vec3::new(0.16, 0.20, 0.075).lerp(Vec3::new(0.27, 0.24, 0.12), 0.5 + 0.7 * drift);
+            let rock = Vec3::new(0.30, 0.27, 0.235) * (1.0 + 0.25 * drift);
+            let bare = noise::smoothstep(0.35, 0.85, steepness + 0.004 * height + 0.25 * drift);
+            grass.lerp(rock, bare)
+        }
+    };
+    let mut rng = Rng::new(combine(
+        world.seed,
+        patch.range.first[0] as u32 ^ (patch.range.first[1] as u32).rotate_left(16),
+    ));
+    plant::tint(soil, &mut rng, 0.03)
+}
