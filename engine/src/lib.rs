@@ -6,6 +6,7 @@
 //!
 //! The engine knows no network, no async runtime and no database.
 
+pub mod bake;
 pub mod batch;
 pub mod brick;
 pub mod brickmap;

@@ -19,9 +19,7 @@ use crate::batch::{BatchPlan, KeepAll, Point, RAYS_PER_BATCH_MAX, SplitOptions, 
 use crate::brick::lanes::InstructionSet;
 use crate::brickmap::{BrickMap, BuildOptions, FarField, OccluderStream, build};
 use crate::cut::{Arena, Lod};
-use crate::output::log::PartLog;
-use crate::output::merge::merge;
-use crate::output::part::{Part, PartFormat};
+use crate::output::{MergeOptions, Part, PartFormat, PartLog, merge};
 use crate::scene::{BakeSet, Scene, Shader, ShaderKind};
 use crate::stats::{BakeReport, BakeSetReport, Report, peak_rss_bytes};
 use crate::stream::{Attribute, MicrogridStream};
@@ -306,17 +304,13 @@ impl BakeSetJob<'_> {
         let start = Instant::now();
         let partial = self.options.points_max.is_some();
         stream.rewind()?;
-        merge(
-            stream.as_mut(),
-            &attributes,
-            &mut log,
-            &scratch,
-            self.options.memory_bytes / 4,
+        let options = MergeOptions {
+            scratch: &scratch,
+            memory_bytes: self.options.memory_bytes / 4,
             partial,
-            &target,
-            &self.metadata(&shaders),
-            &mut control.stage("merge"),
-        )?;
+            metadata: &self.metadata(&shaders),
+        };
+        merge(stream.as_mut(), &plan, &mut log, &options, &target, &mut control.stage("merge"))?;
         report.merge_seconds = start.elapsed().as_secs_f64();
         Ok(report)
     }
