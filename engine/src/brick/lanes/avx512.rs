@@ -135,7 +135,7 @@ impl Lanes for Avx512 {
             return unsafe { Plain::planes(leaf, layout, origin, out) };
         }
         debug_assert!(leaf.len() >= layout.bytes + crate::brick::leaf::READ_PAST_BYTES);
-        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 32 bytes from byte 20,
+        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 20 bytes from byte 20,
         // and 16 coordinates start within the leaf
         unsafe {
             // Unpack the vertices relative to the origin
@@ -159,24 +159,31 @@ impl Lanes for Avx512 {
 
             // Read the corners' indices, 8 faces at a time
             let indices = leaf.as_ptr().add(HEADER_BYTES);
-            let corner: [__m256i; 4] = if layout.byte_indices {
-                let words = _mm256_loadu_si256(indices.cast());
-                let mask = _mm256_set1_epi32(31);
+            let corner: [__m256i; 4] = if layout.columns > 0 {
+                let face = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
+                // face / columns for up to 8 of each, by multiplication
+                let inverse = _mm256_set1_epi32(256_i32.div_euclid(layout.columns as i32) + 1);
+                let row = _mm256_srli_epi32::<8>(_mm256_mullo_epi32(face, inverse));
+                let first = _mm256_add_epi32(face, row);
+                let wide = layout.columns as i32 + 1;
                 [
-                    _mm256_and_si256(words, mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<8>(words), mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<16>(words), mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<24>(words), mask),
+                    first,
+                    _mm256_add_epi32(first, _mm256_set1_epi32(1)),
+                    _mm256_add_epi32(first, _mm256_set1_epi32(wide + 1)),
+                    _mm256_add_epi32(first, _mm256_set1_epi32(wide)),
                 ]
             } else {
-                let words = _mm256_cvtepu16_epi32(_mm_loadu_si128(indices.cast()));
-                let mask = _mm256_set1_epi32(15);
-                [
-                    _mm256_and_si256(words, mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<4>(words), mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<8>(words), mask),
-                    _mm256_srli_epi32::<12>(words),
-                ]
+                let bits = layout.index_bits as i64;
+                let shifts =
+                    _mm512_mullo_epi64(_mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0), _mm512_set1_epi64(bits));
+                let mask = _mm512_set1_epi64((1 << bits) - 1);
+                let mut corner = [_mm256_setzero_si256(); 4];
+                for (c, corner) in corner.iter_mut().enumerate() {
+                    let word = indices.add(c * layout.index_bits).cast::<i64>().read_unaligned();
+                    let spread = _mm512_srlv_epi64(_mm512_set1_epi64(word), shifts);
+                    *corner = _mm512_cvtepi64_epi32(_mm512_and_si512(spread, mask));
+                }
+                corner
             };
             let lanes = [pair(corner[0], corner[0]), pair(corner[1], corner[2]), pair(corner[2], corner[3])];
 
