@@ -10,7 +10,7 @@ use glam::Vec3;
 use super::ALIGNMENT;
 use super::bundle::{Bundle, EXTINCTION_OPAQUE, RAYS_MAX};
 use super::intersect;
-use super::lanes::{Boxes, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
+use super::lanes::{Boxes, Corners, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
 use super::leaf::{self, Layout};
 use super::node::{Child, FAR_BYTES, Node, WIDTH};
 
@@ -83,6 +83,7 @@ pub struct Scratch {
     current: Vec<u16>,
     masks: Vec<u8>,
     boxes: Boxes,
+    corners: Corners,
     planes: Planes,
     /// Rays that met a brick which is not in memory.
     pub waiting: Vec<Waiting>,
@@ -118,6 +119,7 @@ impl Scratch {
                 distance2: [0.0; WIDTH],
                 diagonal2: [0.0; WIDTH],
             },
+            corners: Corners::EMPTY,
             planes: Planes::EMPTY,
             waiting: Vec::new(),
             waiting_rays: Vec::new(),
@@ -269,8 +271,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         // SAFETY: as the caller's
         unsafe { L::boxes(node, self.bundle.reference, &self.bundle.bounds, boxes) };
         let mut targets = [Target::FarField; WIDTH];
-        let mut order = [0_u64; WIDTH];
-        let (mut opened, mut far_mask) = (0, 0_u8);
+        let mut far_mask = 0_u8;
         for slot in 0..usize::from(node.count) {
             let target = if boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot] {
                 Target::FarField
@@ -280,9 +281,6 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             if target == Target::FarField {
                 far_mask |= 1 << slot;
             } else {
-                // Squared distances are not negative: their bits are in their order
-                order[opened] = u64::from(boxes.distance2[slot].to_bits()) << 8 | slot as u64;
-                opened += 1;
                 if let Target::Open { address, .. } = target {
                     prefetch(self.memory, address);
                 }
@@ -292,13 +290,28 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
 
         // Test the rays
         // SAFETY: ray numbers in lists are below the bundle's length; `masks` has the slack
-        unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) };
-        if far_mask != 0 {
+        let any = unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) };
+        if any & far_mask != 0 {
             self.meet_far_fields(&node.far, far_mask, count);
         }
 
         // Open the children, far ones first, so that near ones are visited first
-        order[..opened].sort_unstable_by(|a, b| b.cmp(a));
+        let mut order = [0_u64; WIDTH];
+        let mut opened = 0;
+        let mut open_mask = any & !far_mask & (0xff_u32 >> (8 - u32::from(node.count))) as u8;
+        while open_mask != 0 {
+            let slot = open_mask.trailing_zeros() as usize;
+            open_mask &= open_mask - 1;
+            // Squared distances are not negative: their bits are in their order
+            let key = u64::from(self.scratch.boxes.distance2[slot].to_bits()) << 8 | slot as u64;
+            let mut at = opened;
+            while at > 0 && order[at - 1] < key {
+                order[at] = order[at - 1];
+                at -= 1;
+            }
+            order[at] = key;
+            opened += 1;
+        }
         let mut first = entry.first as usize;
         for &key in &order[..opened] {
             let slot = key as usize & 7;
@@ -385,6 +398,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             self.visit_round_leaf(bytes, &layout, count);
             return;
         }
+        // SAFETY: the brick was checked when it was loaded, and memory runs on past it
+        unsafe { L::corners(bytes, &layout, self.bundle.reference, &mut self.scratch.corners) };
         // Rays are in order: each origin's are a run
         let mut at = 0;
         for origin in 0..self.bundle.origins.len() {
@@ -396,8 +411,10 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             if at == start {
                 continue;
             }
-            // SAFETY: the brick was checked when it was loaded, and memory runs on past it
-            unsafe { L::planes(bytes, &layout, origin.position, &mut self.scratch.planes) };
+            let offset = origin.position.wrapping_sub(self.bundle.reference);
+            let Scratch { corners, planes, .. } = &mut *self.scratch;
+            // SAFETY: as the caller's
+            unsafe { L::planes(corners, offset, planes) };
             if self.scratch.planes.valid == 0 {
                 continue;
             }
