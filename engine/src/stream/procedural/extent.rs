@@ -110,15 +110,19 @@ pub fn fit(kind: ProceduralKind, seed: u32, count: u64) -> (World, Extent) {
         return world(kind, seed, side, count, &[0.0; Species::ALL.len()]);
     }
     let mean_quads = mean_quads(kind, seed);
-    // Quads grow with the side, nearly without exception: bisect.
-    let (mut low, mut high) = (1i64, ((count as f64 / 16.0).sqrt() as i64).max(2));
+    // Quads grow with the side, nearly without exception, and the ground alone has no more than all: bisect.
+    let (mut low, mut high) = (0i64, (count as f64).sqrt().round().max(1.0) as i64);
     while high - low > 1 {
         let middle = (low + high) / 2;
         let (world, extent) = world(kind, seed, middle as i32, count, &mean_quads);
         let [fixed, adjustable] = estimate(&world, &extent);
-        if fixed + adjustable < count as f64 { low = middle } else { high = middle }
+        if fixed + adjustable < count as f64 {
+            low = middle;
+        } else {
+            high = middle;
+        }
     }
-    let (mut world, extent) = world(kind, seed, low as i32, count, &mean_quads);
+    let (mut world, extent) = world(kind, seed, high as i32, count, &mean_quads);
     adjust(&mut world, &extent, count);
     (world, extent)
 }
@@ -133,8 +137,8 @@ fn world(
     let quad_meters = Ground::new(kind, seed, 0.0).quad_meters;
     let extent = Extent::new(side, quad_meters);
     let mut scatter = Scatter::new(kind, seed, extent.half_meters(), *mean_quads);
-    // No plant makes up more than a twentieth of the stream.
-    scatter.plant_quads_max = count as f64 / 20.0;
+    // No plant makes up more than a twentieth of the stream; a tuft of grass may make up an eighth.
+    scatter.plant_quads_max = (count as f64 / 20.0).max((count as f64 / 8.0).min(120.0));
     let ground = Ground::new(kind, seed, scatter.clearing);
     (World { kind, seed, ground, scatter }, extent)
 }

@@ -124,7 +124,7 @@ pub fn palm(plan: &mut Plan, rng: &mut Rng, scale: f32) {
             length: 0.62 * scale,
             half_width: 0.021 * scale,
             bend: 0.9,
-            fold: (0.94, 0.34),
+            fold: 0.36,
             columns: 2,
             rows: 4,
         };
@@ -187,7 +187,7 @@ fn pinnae(plan: &mut Plan, rng: &mut Rng, rib: &Rib, scale: f32, albedo: Vec3) {
                 length: scale * 0.085 * (0.35 + 0.65 * size),
                 half_width: spacing * 0.44,
                 bend: 0.5,
-                fold: (1.0, 0.0),
+                fold: 0.0,
                 columns: 1,
                 rows: 2,
             };
@@ -216,7 +216,7 @@ pub fn fern(plan: &mut Plan, rng: &mut Rng, scale: f32) {
             length: 0.19 * scale,
             half_width: 0.0135 * scale,
             bend: 0.5,
-            fold: (0.97, 0.24),
+            fold: 0.25,
             columns: 2,
             rows: 4,
         };

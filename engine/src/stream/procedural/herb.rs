@@ -45,7 +45,7 @@ pub fn banana(plan: &mut Plan, rng: &mut Rng, scale: f32) {
                 length,
                 half_width: length * rng.range(0.13, 0.165),
                 bend: 0.85 + 0.75 * age,
-                fold: (0.93, 0.50),
+                fold: 0.54,
                 columns: 2,
                 rows: 1,
             },
@@ -134,7 +134,7 @@ pub fn stalked(plan: &mut Plan, rng: &mut Rng, scale: f32, form: &Stalked) {
                 length,
                 half_width: form.width * length,
                 bend: 0.6 + 0.5 * rng.unit(),
-                fold: (0.96, 0.42),
+                fold: 0.44,
                 columns: 2,
                 rows: 1,
             },
@@ -170,8 +170,8 @@ pub fn shrub(plan: &mut Plan, rng: &mut Rng, scale: f32) {
         let curve =
             Curve::between(Vec3::new(0.0, -0.05, 0.0), Vec3::Y * height + out * 0.2, to, out * height);
         plan.tube(Tube::plain(curve, [0.016 * scale, 0.005 * scale], [6, 6]), Vec3::new(0.14, 0.11, 0.07));
-        for sprig in 0..9 {
-            let at = 0.22 + 0.78 * (sprig as f32 + rng.unit()) / 9.0;
+        for sprig in 0..6 {
+            let at = 0.22 + 0.78 * (sprig as f32 + rng.unit()) / 6.0;
             let axis = unit_or(curve.tangent(at) * 0.5 + rng.vec3() * 0.8 + Vec3::Y * 0.25, Vec3::Y);
             let sprig = Sprig {
                 base: curve.point(at),
@@ -183,7 +183,7 @@ pub fn shrub(plan: &mut Plan, rng: &mut Rng, scale: f32) {
                     length: leaf,
                     half_width: leaf * 0.27,
                     bend: 0.7,
-                    fold: (0.95, 0.31),
+                    fold: 0.33,
                     columns: 2,
                     rows: 4,
                 },
@@ -209,7 +209,7 @@ pub fn rosette(plan: &mut Plan, rng: &mut Rng, scale: f32) {
             length,
             half_width: length * 0.34,
             bend: 0.8,
-            fold: (0.96, 0.28),
+            fold: 0.29,
             columns: 2,
             rows: 4,
         },
@@ -222,7 +222,7 @@ pub fn rosette(plan: &mut Plan, rng: &mut Rng, scale: f32) {
 
 /// A blade of grass of four quads.
 pub fn grass_blade(length: f32, half_width: f32, bend: f32) -> Blade {
-    Blade { outline: &GRASS, length, half_width, bend, fold: (1.0, 0.0), columns: 1, rows: 4 }
+    Blade { outline: &GRASS, length, half_width, bend, fold: 0.0, columns: 1, rows: 4 }
 }
 
 /// Greens and straws of grass.
@@ -233,12 +233,12 @@ fn grass_color(rng: &mut Rng) -> Vec3 {
 
 /// Plans a tuft of short grass.
 pub fn grass(plan: &mut Plan, rng: &mut Rng, scale: f32) {
-    let length = scale * rng.range(0.16, 0.34);
+    let length = scale * rng.range(0.18, 0.38);
     let tuft = Tuft {
         base: Vec3::new(0.0, -0.01, 0.0),
         radius: scale * 0.13,
         blades: 25,
-        blade: grass_blade(length, 0.0042 * (0.6 + 0.4 * scale), 1.1),
+        blade: grass_blade(length, 0.0052 * (0.6 + 0.4 * scale), 1.1),
         lean: [0.05, 0.75],
         uneven: 0.55,
         seed: rng.bits(),
@@ -253,7 +253,7 @@ pub fn tall_grass(plan: &mut Plan, rng: &mut Rng, scale: f32) {
         base: Vec3::new(0.0, -0.01, 0.0),
         radius: scale * 0.10,
         blades: 25,
-        blade: grass_blade(length, 0.0045, 1.2),
+        blade: grass_blade(length, 0.0055, 1.2),
         lean: [0.05, 0.5],
         uneven: 0.5,
         seed: rng.bits(),
@@ -275,7 +275,7 @@ pub fn tall_grass(plan: &mut Plan, rng: &mut Rng, scale: f32) {
                 length: 0.022,
                 half_width: 0.0035,
                 bend: 0.2,
-                fold: (1.0, 0.0),
+                fold: 0.0,
                 columns: 1,
                 rows: 2,
             },
@@ -297,7 +297,7 @@ pub fn flower(plan: &mut Plan, rng: &mut Rng, scale: f32) {
         (Vec3::new(0.13, 0.17, 0.62), Vec3::new(0.10, 0.06, 0.30), 12, 0.020, 0.28),
     ];
     let (petal, eye, petals, length, width) = kinds[rng.count(0, 3) as usize];
-    let top = direction(rng.unit() * TURN, rng.range(1.2, 1.55)) * (scale * rng.range(0.28, 0.55));
+    let top = direction(rng.unit() * TURN, rng.range(1.2, 1.55)) * (scale * rng.range(0.36, 0.62));
     let curve = Curve::between(Vec3::ZERO, Vec3::Y * top.y, top, top + Vec3::Y * 0.1);
     let green = tint(Vec3::new(0.14, 0.27, 0.06), rng, 0.2);
     plan.tube(Tube::plain(curve, [0.0026, 0.0018], [5, 8]), green);
@@ -310,7 +310,7 @@ pub fn flower(plan: &mut Plan, rng: &mut Rng, scale: f32) {
             length: 0.15 * scale,
             half_width: 0.014,
             bend: 0.9,
-            fold: (0.96, 0.28),
+            fold: 0.29,
             columns: 2,
             rows: 4,
         },
@@ -319,7 +319,7 @@ pub fn flower(plan: &mut Plan, rng: &mut Rng, scale: f32) {
         seed: rng.bits(),
     };
     plan.push(Shape::Tuft(foliage), green);
-    let length = length * rng.range(0.9, 1.25);
+    let length = length * rng.range(1.1, 1.6);
     let corolla = Tuft {
         base: top,
         radius: 0.004,
@@ -329,7 +329,7 @@ pub fn flower(plan: &mut Plan, rng: &mut Rng, scale: f32) {
             length,
             half_width: length * width,
             bend: 0.3,
-            fold: (0.97, 0.22),
+            fold: 0.23,
             columns: 2,
             rows: 4,
         },
@@ -339,7 +339,7 @@ pub fn flower(plan: &mut Plan, rng: &mut Rng, scale: f32) {
     };
     plan.push(Shape::Tuft(corolla), tint(petal, rng, 0.12));
     let dome = Curve::line(top - Vec3::Y * 0.001, top + Vec3::Y * 0.006);
-    plan.tube(Tube { taper: Taper::Dome, ..Tube::plain(dome, [0.007, 0.001], [8, 4]) }, eye);
+    plan.tube(Tube { taper: Taper::Dome, ..Tube::plain(dome, [0.009, 0.001], [8, 4]) }, eye);
 }
 
 /// Leaves lying on the ground.
@@ -397,7 +397,7 @@ pub fn litter(plan: &mut Plan, rng: &mut Rng, scale: f32, slope: [f32; 2]) {
             length,
             half_width: length * 0.25,
             bend: 0.8,
-            fold: (0.95, 0.31),
+            fold: 0.33,
             columns: 2,
             rows: 4,
         },

@@ -80,8 +80,8 @@ pub struct Blade {
     pub half_width: f32,
     /// How far it bends down over its length, in radians.
     pub bend: f32,
-    /// How far each half is folded up along the midrib: cosine and sine.
-    pub fold: (f32, f32),
+    /// How far each half is folded up along the midrib: rise over run.
+    pub fold: f32,
     /// 1 quad across (flat) or 2 (folded).
     pub columns: u32,
     /// Quads along: 1, 2, 4, 8 or 16.
@@ -95,7 +95,9 @@ impl Blade {
         let side = frame.side();
         let step = self.length / self.rows as f32;
         let (sin, cos) = sincos(self.bend / self.rows as f32);
-        let (fold_cos, fold_sin) = if self.columns == 2 { self.fold } else { (1.0, 0.0) };
+        let fold = if self.columns == 2 { self.fold } else { 0.0 };
+        let fold_cos = 1.0 / (1.0 + fold * fold).sqrt();
+        let fold_sin = fold * fold_cos;
         let stations = 16 / self.rows as usize;
         let mut origin = frame.origin;
         for row in 0..=self.rows as usize {
@@ -321,13 +323,13 @@ impl BigLeaf {
             (sincos(self.phase + self.waves * v).0, sincos(2.3 * self.phase + 1.17 * self.waves * v).0);
         let tooth = self.waves * v * (1.0 / super::trig::TURN) + self.phase;
         let notch = 1.0 - self.cuts * (2.0 * (tooth - tooth.floor()) - 1.0).abs();
-        let width = half_width * width_at(outline, v) * notch;
+        let width = half_width * width_at(outline, v) * notch / (1.0 + fold * fold).sqrt();
         for (column, vertex) in out.iter_mut().enumerate() {
             let u = 2.0 * (column as f32 - 1.0) / columns as f32 - 1.0;
             let wave = if u < 0.0 { wave_left } else { wave_right };
             // Each half rises from the midrib, then arches down to the margin.
-            let rise = u.abs() * fold.1 - 0.45 * u * u * fold.1 + self.ripple * wave * u * u;
-            *vertex = center + side * (u * width * fold.0) + up * (rise * width);
+            let rise = u.abs() * fold - 0.45 * u * u * fold + self.ripple * wave * u * u;
+            *vertex = center + side * (u * width) + up * (rise * width);
         }
     }
 }

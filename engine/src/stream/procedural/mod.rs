@@ -32,7 +32,7 @@ use crate::stream::{Microgrid, MicrogridStream};
 use crate::{Error, Result};
 
 use extent::{Extent, World};
-use noise::{Rng, noise};
+use noise::noise;
 use pen::{Paint, Pen, Space};
 use plant::{Part, Plan, Site};
 use terrain::Patch;
@@ -196,22 +196,18 @@ fn ground_albedo(world: &World, patch: &Patch) -> Vec3 {
     let [x, z] = [0, 1].map(|axis| {
         (patch.range.first[axis] as f32 + 0.5 * patch.range.quads[axis] as f32) * world.ground.quad_meters
     });
-    let (height, steepness) = patch.middle();
+    let (height, steepness) = patch.lie();
     let drift = noise(world.seed ^ 0x5011, x * 0.031, z * 0.031)
         + 0.5 * noise(world.seed ^ 0x5012, x * 0.12, z * 0.12);
-    let soil = match world.kind {
-        ProceduralKind::Jungle => Vec3::new(0.115, 0.082, 0.050) * (1.0 + 0.4 * drift),
-        ProceduralKind::Grass => Vec3::new(0.13, 0.125, 0.055) * (1.0 + 0.4 * drift),
+    match world.kind {
+        ProceduralKind::Jungle => Vec3::new(0.100, 0.075, 0.046) * (1.0 + 0.4 * drift),
+        ProceduralKind::Grass => Vec3::new(0.085, 0.105, 0.036) * (1.0 + 0.4 * drift),
         ProceduralKind::Terrain => {
-            let grass = Vec3::new(0.16, 0.20, 0.075).lerp(Vec3::new(0.27, 0.24, 0.12), 0.5 + 0.7 * drift);
-            let rock = Vec3::new(0.30, 0.27, 0.235) * (1.0 + 0.25 * drift);
-            let bare = noise::smoothstep(0.35, 0.85, steepness + 0.004 * height + 0.25 * drift);
+            let grass = Vec3::new(0.13, 0.155, 0.065).lerp(Vec3::new(0.22, 0.195, 0.10), 0.5 + 0.6 * drift);
+            let rock = Vec3::new(0.23, 0.205, 0.175) * (1.0 + 0.2 * drift);
+            // A wide band: patches are one colour each, and must not show.
+            let bare = noise::smoothstep(0.05, 1.0, 0.55 * steepness + 0.006 * height + 0.12 * drift);
             grass.lerp(rock, bare)
         }
-    };
-    let mut rng = Rng::new(combine(
-        world.seed,
-        patch.range.first[0] as u32 ^ (patch.range.first[1] as u32).rotate_left(16),
-    ));
-    plant::tint(soil, &mut rng, 0.03)
+    }
 }

@@ -29,44 +29,44 @@ use Species::*;
 
 const JUNGLE: &[Storey] = &[
     Storey {
-        spacing: 8.5,
+        spacing: 7.6,
         species: &[(Giant, 1.0)],
-        chance: 0.8,
+        chance: 0.85,
         in_clearing: 0.0,
         at_edge: 0.0,
-        setback: 3.0,
+        setback: 2.2,
         adjustable: false,
     },
     Storey {
-        spacing: 4.6,
-        species: &[(Sapling, 0.5), (Palm, 0.28), (TreeFern, 0.22)],
+        spacing: 3.5,
+        species: &[(Sapling, 0.62), (Palm, 0.24), (TreeFern, 0.14)],
         chance: 0.62,
         in_clearing: 0.0,
         at_edge: 0.2,
-        setback: 1.0,
+        setback: 1.2,
         adjustable: false,
     },
     Storey {
-        spacing: 2.3,
-        species: &[(Banana, 0.26), (Shrub, 0.34), (ElephantEar, 0.16), (SplitLeaf, 0.16), (TreeFern, 0.08)],
-        chance: 0.40,
+        spacing: 2.2,
+        species: &[(Banana, 0.26), (Shrub, 0.3), (ElephantEar, 0.18), (SplitLeaf, 0.2), (TreeFern, 0.06)],
+        chance: 0.55,
         in_clearing: 0.0,
-        at_edge: 0.45,
-        setback: -1.0,
+        at_edge: 0.5,
+        setback: -0.8,
         adjustable: true,
     },
     Storey {
         spacing: 1.1,
-        species: &[(Fern, 0.50), (Shrub, 0.10), (ElephantEar, 0.14), (SplitLeaf, 0.16), (Rosette, 0.10)],
-        chance: 0.34,
-        in_clearing: 0.22,
+        species: &[(Fern, 0.46), (Shrub, 0.1), (ElephantEar, 0.16), (SplitLeaf, 0.16), (Rosette, 0.12)],
+        chance: 0.46,
+        in_clearing: 0.16,
         at_edge: 0.35,
-        setback: -2.0,
+        setback: -1.6,
         adjustable: true,
     },
     Storey {
         spacing: 4.2,
-        species: &[(Stone, 0.45), (Log, 0.25), (Mushrooms, 0.30)],
+        species: &[(Stone, 0.45), (Log, 0.25), (Mushrooms, 0.3)],
         chance: 0.5,
         in_clearing: 0.7,
         at_edge: 0.0,
@@ -74,11 +74,11 @@ const JUNGLE: &[Storey] = &[
         adjustable: true,
     },
     Storey {
-        spacing: 0.36,
-        species: &[(Grass, 0.50), (Litter, 0.42), (Rosette, 0.08)],
-        chance: 0.34,
-        in_clearing: 2.2,
-        at_edge: 0.2,
+        spacing: 0.27,
+        species: &[(Grass, 0.52), (Litter, 0.32), (Rosette, 0.16)],
+        chance: 0.46,
+        in_clearing: 2.3,
+        at_edge: 0.25,
         setback: 0.0,
         adjustable: true,
     },
@@ -95,18 +95,18 @@ const MEADOW: &[Storey] = &[
         adjustable: true,
     },
     Storey {
-        spacing: 0.42,
-        species: &[(TallGrass, 0.62), (Flower, 0.38)],
-        chance: 0.5,
+        spacing: 0.4,
+        species: &[(TallGrass, 0.45), (Flower, 0.55)],
+        chance: 0.6,
         in_clearing: 1.0,
         at_edge: 0.0,
         setback: 0.0,
         adjustable: true,
     },
     Storey {
-        spacing: 0.17,
+        spacing: 0.15,
         species: &[(Grass, 0.93), (Rosette, 0.07)],
-        chance: 0.62,
+        chance: 0.66,
         in_clearing: 1.0,
         at_edge: 0.0,
         setback: 0.0,
@@ -213,10 +213,12 @@ impl Scatter {
                     let seed = combine(combine(combine(self.seed, number as u32), i as u32), j as u32);
                     let x = (i as f32 + unit_f32(combine(seed, 1))) * storey.spacing;
                     let z = (j as f32 + unit_f32(combine(seed, 2))) * storey.spacing;
-                    if x >= low[0] && x < high[0] && z >= low[1] && z < high[1] {
-                        if let Some(candidate) = self.candidate(storey, number as u32, seed, x, z) {
-                            each(candidate);
-                        }
+                    let inside = x >= low[0] && x < high[0] && z >= low[1] && z < high[1];
+                    if !inside {
+                        continue;
+                    }
+                    if let Some(candidate) = self.candidate(storey, number as u32, seed, x, z) {
+                        each(candidate);
                     }
                 }
             }
@@ -264,7 +266,7 @@ impl Scatter {
         let mut chance =
             storey.chance * (storey.in_clearing * (1.0 - forest) + forest) + storey.at_edge * edge;
         let off_path = (x - path(z)).abs() - species.reach() * 0.35;
-        chance *= if species == Litter { 1.0 } else { smoothstep(0.25, 0.75, off_path) };
+        chance *= if species == Litter { 1.0 } else { smoothstep(0.12, 0.55, off_path) };
         let low = matches!(species, Grass | Litter | Rosette | Stone | Log | Mushrooms);
         let scale = if low { scale } else { scale * (0.6 + 0.4 * forest) };
         chance *= match species {
@@ -280,7 +282,7 @@ impl Scatter {
     fn in_meadow(&self, species: Species, scale: f32, x: f32, z: f32, chance: f32) -> (f32, f32) {
         let drift = noise(self.seed ^ 0xf10e_4e45, x * 0.11, z * 0.11);
         let chance = match species {
-            Flower => chance * (0.8 + 1.6 * drift),
+            Flower => chance * (0.8 + 2.2 * drift),
             _ => chance,
         };
         (chance, scale * (1.0 + 0.4 * drift))
@@ -330,7 +332,7 @@ fn stand(kind: ProceduralKind, half: f32, clearing: f32) -> Stand {
                 foot: [0.0, 0.6 * reach],
                 eye: 1.1,
                 target: [0.0, -0.6 * reach],
-                target_height: 0.45,
+                target_height: 0.05,
                 fov_degrees: 45.0,
             }
         }
@@ -384,7 +386,7 @@ mod tests {
                 let reach = site.species.reach() * site.scale;
                 assert!(reach == 0.0 || distance >= 1.5 + reach, "{site:?}");
                 let radius = site.x.hypot(site.z);
-                assert!(site.species != Species::Giant || radius > 0.5 * scatter.clearing);
+                assert!(site.species != Giant || radius > 0.5 * scatter.clearing);
             }
         }
     }

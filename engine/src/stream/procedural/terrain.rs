@@ -2,7 +2,7 @@
 
 use glam::{DVec3, Vec3};
 
-use super::noise::{NoiseCell, smoothstep};
+use super::noise::{NoiseLine, smoothstep};
 use super::pen::{Pen, Topology};
 use crate::math::hash::combine;
 use crate::scene::ProceduralKind;
@@ -12,6 +12,17 @@ pub const PATCH_QUADS: i32 = 15;
 
 /// Vertices along the side of a patch with one more on every side, for normals.
 const PITCH_MAX: usize = PATCH_QUADS as usize + 3;
+
+/// 0, 1, 2 ... as the compiler's vectors like them: it does not vectorise conversions of 64-bit counters.
+const STEPS: [f32; PITCH_MAX] = {
+    let mut steps = [0.0; PITCH_MAX];
+    let mut i = 0;
+    while i < PITCH_MAX {
+        steps[i] = i as f32;
+        i += 1;
+    }
+    steps
+};
 
 /// One octave of the ground's noise.
 #[derive(Clone, Copy, Debug)]
@@ -102,26 +113,25 @@ impl Ground {
         for octave in &self.octaves {
             let wavelength = 1i32 << octave.wavelength_log2;
             let (scale, mask) = (1.0 / wavelength as f32, wavelength - 1);
-            let per_meter = octave.amplitude * scale / self.quad_meters;
-            let cell_z = z >> octave.wavelength_log2;
-            let z_in_cell = (z & mask) as f32 * scale;
             let mut i = 0;
             while i < count {
                 // All vertices up to the next line of the lattice share the gradients.
                 let vertex = x + i as i32;
-                let run = (wavelength - (vertex & mask)) as usize;
-                let end = (i + run).min(count);
-                let cell = NoiseCell::new(octave.seed, vertex >> octave.wavelength_log2, cell_z);
-                let mut x_in_cell = (vertex & mask) as f32;
-                for k in i..end {
-                    let sample = cell.sample(x_in_cell * scale, z_in_cell);
-                    x_in_cell += 1.0;
-                    let (value, sign) = if octave.ridged { ridge(sample.value) } else { (sample.value, 1.0) };
-                    let damping =
-                        1.0 / (1.0 + self.erosion * (slope_x[k] * slope_x[k] + slope_z[k] * slope_z[k]));
-                    heights[k] += octave.amplitude * damping * value;
-                    slope_x[k] += per_meter * sign * sample.dx;
-                    slope_z[k] += per_meter * sign * sample.dz;
+                let end = (i + (wavelength - (vertex & mask)) as usize).min(count);
+                let (cell_x, cell_z) = (vertex >> octave.wavelength_log2, z >> octave.wavelength_log2);
+                let run = Run {
+                    line: NoiseLine::new(octave.seed, cell_x, cell_z, (z & mask) as f32 * scale),
+                    first: (vertex & mask) as f32,
+                    scale,
+                    amplitude: octave.amplitude,
+                    slope: octave.amplitude * scale / self.quad_meters,
+                    erosion: self.erosion,
+                };
+                let (sx, sz) = (&mut slope_x[i..end], &mut slope_z[i..end]);
+                if octave.ridged {
+                    run.add(&mut heights[i..end], sx, sz, ridge);
+                } else {
+                    run.add(&mut heights[i..end], sx, sz, |value| (value, 1.0));
                 }
                 i = end;
             }
@@ -131,7 +141,7 @@ impl Ground {
                 let (mx, mz) = ((x + i as i32) as f32 * self.quad_meters, z as f32 * self.quad_meters);
                 let radius = (mx * mx + mz * mz).sqrt();
                 let flat = 0.3 + 0.7 * smoothstep(0.6 * clearing, clearing + 8.0, radius);
-                *height = *height * flat + 3.5 * smoothstep(clearing, clearing + 22.0, radius);
+                *height = *height * flat + 5.0 * smoothstep(clearing, clearing + 26.0, radius);
             }
         }
     }
@@ -153,6 +163,42 @@ impl Ground {
         self.row(vx as i32, vz as i32, &mut low);
         self.row(vx as i32, vz as i32 + 1, &mut high);
         bilinear([low, high], x / self.quad_meters - vx, z / self.quad_meters - vz)
+    }
+}
+
+/// Vertices of a row that lie in one cell of an octave's lattice.
+struct Run {
+    line: NoiseLine,
+    /// Quads from the cell's edge to the first vertex.
+    first: f32,
+    /// Cells per quad.
+    scale: f32,
+    /// Metres.
+    amplitude: f32,
+    /// Metres per metre for a derivative of 1 per cell.
+    slope: f32,
+    erosion: f32,
+}
+
+impl Run {
+    /// Adds the octave, shaped by `form` (value, factor of the slope), to heights and slopes.
+    #[inline]
+    fn add(
+        &self,
+        heights: &mut [f32],
+        slope_x: &mut [f32],
+        slope_z: &mut [f32],
+        form: impl Fn(f32) -> (f32, f32),
+    ) {
+        let sums = heights.iter_mut().zip(slope_x).zip(slope_z).zip(&STEPS);
+        for (((height, slope_x), slope_z), step) in sums {
+            let sample = self.line.sample((self.first + step) * self.scale);
+            let (value, sign) = form(sample.value);
+            let damping = 1.0 / (1.0 + self.erosion * (*slope_x * *slope_x + *slope_z * *slope_z));
+            *height += self.amplitude * damping * value;
+            *slope_x += self.slope * sign * sample.dx;
+            *slope_z += self.slope * sign * sample.dz;
+        }
     }
 }
 
@@ -204,15 +250,14 @@ impl Patch {
         bilinear([pair(row), pair(row + 1)], fx, fz)
     }
 
-    /// Height (m) and steepness (rise over run) in the middle.
-    pub fn middle(&self) -> (f32, f32) {
-        let (pitch, row, column) =
-            (self.pitch(), self.range.quads[1] as usize / 2 + 1, self.range.quads[0] as usize / 2 + 1);
-        let at = |row: usize, column: usize| self.heights[row * pitch + column];
-        let run = 2.0 * self.quad_meters;
-        let dx = (at(row, column + 1) - at(row, column - 1)) / run;
-        let dz = (at(row + 1, column) - at(row - 1, column)) / run;
-        (at(row, column), (dx * dx + dz * dz).sqrt())
+    /// Mean height (m) and steepness (rise over run) between the corners.
+    pub fn lie(&self) -> (f32, f32) {
+        let (pitch, [columns, rows]) = (self.pitch(), self.range.quads.map(|quads| quads as usize));
+        let at = |row: usize, column: usize| self.heights[(row + 1) * pitch + column + 1];
+        let (a, b, c, d) = (at(0, 0), at(0, columns), at(rows, 0), at(rows, columns));
+        let dx = (b - a + d - c) / (2.0 * columns as f32 * self.quad_meters);
+        let dz = (c - a + d - b) / (2.0 * rows as f32 * self.quad_meters);
+        (0.25 * (a + b + c + d), (dx * dx + dz * dz).sqrt())
     }
 
     /// Draws the patch. Columns run along z and rows along x, so that faces look up.

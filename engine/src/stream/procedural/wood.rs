@@ -146,7 +146,7 @@ impl Stone {
     pub fn draw(&self, pen: &mut Pen) -> Topology {
         let mut rng = Rng::new(self.seed);
         let cuts: [(Vec3, f32); CUTS] =
-            std::array::from_fn(|_| (unit_or(rng.vec3(), Vec3::X), rng.range(0.62, 0.95)));
+            std::array::from_fn(|_| (unit_or(rng.vec3(), Vec3::X), rng.range(0.52, 0.85)));
         let mut lattice = [Vec3::ZERO; 18 * 18];
         let pitch = self.quads as usize + 3;
         for row in 0..pitch {
