@@ -269,8 +269,7 @@ impl Slot {
                 }
                 None => 1.0,
             };
-            // Fully transparent, or not a number.
-            if !(opacity > 0.0) {
+            if opacity <= 0.0 || opacity.is_nan() {
                 continue;
             }
             let salt = if opacity < 1.0 { combine(self.number, number as u32) } else { 0 };

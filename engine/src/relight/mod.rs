@@ -77,7 +77,11 @@ pub struct RelightOptions {
 
 impl RelightOptions {
     /// The defaults for an environment: automatic framing at 1280 × 720, background, 2 × 2 samples per pixel.
+    ///
+    /// A map is projected to the visibility's bands and no more. A sun would ring there and leave black and blue
+    /// patches where the sum turns negative, so an environment that has one gets all 6 bands under a Lanczos window.
     pub fn new(environment: Environment) -> Self {
+        let sunny = environment.sun().is_some();
         Self {
             viewpoint: Viewpoint::Automatic([1280, 720]),
             environment,
@@ -86,9 +90,9 @@ impl RelightOptions {
             attribute: None,
             weight: Weight::Uniform,
             domain: None,
-            light_bands: None,
+            light_bands: sunny.then_some(BANDS_MAX as u32),
             cosine_bands: None,
-            window: Window::None,
+            window: if sunny { Window::Lanczos } else { Window::None },
             background: true,
             supersampling: 2,
         }
@@ -159,7 +163,7 @@ pub fn relight(
 
 /// Checks the options against the stream and contracts the light.
 fn shading(schema: &Schema, options: &RelightOptions) -> Result<Shading> {
-    if !(options.exposure_stops.abs() <= 100.0) || !options.rotation_degrees.is_finite() {
+    if !(-100.0..=100.0).contains(&options.exposure_stops) || !options.rotation_degrees.is_finite() {
         return Err(Error::invalid(format!(
             "an exposure of `{}` stops and a rotation of `{}` degrees",
             options.exposure_stops, options.rotation_degrees

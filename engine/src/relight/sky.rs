@@ -3,7 +3,8 @@
 //! The clear ones follow Preetham, Shirley and Smits, "A Practical Analytic Model for Daylight" (SIGGRAPH 1999): the
 //! sky by their fit of Perez' formula, the sun by their atmosphere's transmittance at three wavelengths. The overcast
 //! one is the CIE's (Moon and Spencer 1942). The ground below the horizon is a grey plain lit by all of it.
-//! Everything is scaled so that a white horizontal plate under the open sky has the radiance 1.
+//! Everything is scaled as a photographer would expose it: a white plate turned to where it is brightest, and to
+//! nothing but the environment, has the radiance 1.
 
 use glam::DVec3;
 
@@ -41,6 +42,15 @@ impl Sky {
             Self::Sunset => 2.2,
         }
     }
+
+    /// Perez' formula is held below this cosine to the zenith, where it divides by zero in the end. By day and in
+    /// clear air the fit turns mauve in the last degrees above the horizon; at dusk that band is what glows.
+    fn cosine_min(self) -> f64 {
+        match self {
+            Self::Clear | Self::Overcast => 0.15,
+            Self::Sunset => 0.06,
+        }
+    }
 }
 
 /// Where a sun stands.
@@ -76,7 +86,7 @@ const MAP_SIZE: [usize; 2] = [512, 256];
 /// A sky as a map and, unless overcast, its sun.
 pub(super) fn render(sky: Sky, position: SunPosition) -> (LatLong, Option<Sun>) {
     let towards_sun = position.direction();
-    let preetham = Preetham::new(sky.turbidity(), towards_sun);
+    let preetham = Preetham::new(sky, towards_sun);
     let above = |d: DVec3| match sky {
         Sky::Overcast => [(1.0 + 2.0 * d.y) / 3.0; 3],
         Sky::Clear | Sky::Sunset => preetham.radiance(d),
@@ -86,26 +96,23 @@ pub(super) fn render(sky: Sky, position: SunPosition) -> (LatLong, Option<Sun>) 
         Sky::Clear | Sky::Sunset => preetham.sun_irradiance(),
     };
 
-    // Sum what the ground receives
-    let mut ground = sun.map(|value| value * towards_sun.y);
+    // Light the ground
     let [width, height] = MAP_SIZE;
-    let template = LatLong::from_fn(width, height, |_| [0.0; 3]);
-    for (direction, solid_angle, _) in template.samples().filter(|(direction, ..)| direction.y > 0.0) {
-        let radiance = above(direction);
-        for (sum, value) in ground.iter_mut().zip(radiance) {
-            *sum += value * direction.y * solid_angle;
-        }
-    }
+    let upper =
+        LatLong::from_fn(width, height, |d| if d.y > 0.0 { above(d) } else { [0.0; 3] }.map(|v| v as f32));
+    let ground =
+        irradiance(&upper, sun, towards_sun, DVec3::Y).map(|v| v * GROUND_ALBEDO / std::f64::consts::PI);
+    let whole =
+        LatLong::from_fn(width, height, |d| if d.y > 0.0 { above(d) } else { ground }.map(|v| v as f32));
 
-    // Scale to a white plate of radiance 1
-    let scale = std::f64::consts::PI / luminance(ground);
+    // Scale to the brightest white plate, which leans towards the sun
+    let brightest = (0..=18)
+        .map(|step| SunPosition { elevation_degrees: 5.0 * f64::from(step), ..position }.direction())
+        .map(|normal| luminance(irradiance(&whole, sun, towards_sun, normal)))
+        .fold(0.0, f64::max);
+    let scale = std::f64::consts::PI / brightest;
     let map = LatLong::from_fn(width, height, |d| {
-        let radiance = if d.y > 0.0 {
-            above(d)
-        } else {
-            ground.map(|value| value * GROUND_ALBEDO / std::f64::consts::PI)
-        };
-        radiance.map(|value| (value * scale) as f32)
+        if d.y > 0.0 { above(d) } else { ground }.map(|value| (value * scale) as f32)
     });
     let sun = (sky != Sky::Overcast).then(|| Sun {
         direction: towards_sun,
@@ -113,6 +120,16 @@ pub(super) fn render(sky: Sky, position: SunPosition) -> (LatLong, Option<Sun>) 
         radius_radians: SUN_RADIUS_RADIANS,
     });
     (map, sun)
+}
+
+/// What a plate that faces `normal` receives from a map and a sun.
+fn irradiance(map: &LatLong, sun: [f64; 3], towards_sun: DVec3, normal: DVec3) -> [f64; 3] {
+    let mut sum = sun.map(|value| value * normal.dot(towards_sun).max(0.0));
+    for (direction, solid_angle, rgb) in map.samples() {
+        let weight = solid_angle * normal.dot(direction).max(0.0);
+        sum.iter_mut().zip(rgb).for_each(|(sum, value)| *sum += weight * f64::from(value));
+    }
+    sum
 }
 
 /// Luminance of linear sRGB (IEC 61966-2-1).
@@ -123,6 +140,7 @@ fn luminance([r, g, b]: [f64; 3]) -> f64 {
 /// The model's coefficients for a turbidity and a sun. Radiances are in kcd/m², irradiances in klx.
 struct Preetham {
     turbidity: f64,
+    cosine_min: f64,
     towards_sun: DVec3,
     /// Perez' A to E for luminance Y and chromaticities x and y.
     perez: [[f64; 5]; 3],
@@ -131,7 +149,8 @@ struct Preetham {
 }
 
 impl Preetham {
-    fn new(t: f64, towards_sun: DVec3) -> Self {
+    fn new(sky: Sky, towards_sun: DVec3) -> Self {
+        let t = sky.turbidity();
         // Appendix A.2 of the paper: slopes and intercepts over the turbidity.
         let perez = [
             [
@@ -176,13 +195,12 @@ impl Preetham {
             ]),
         ];
         let zenith = std::array::from_fn(|i| absolute[i] / formula(&perez[i], 1.0, s));
-        Self { turbidity: t, towards_sun, perez, zenith }
+        Self { turbidity: t, cosine_min: sky.cosine_min(), towards_sun, perez, zenith }
     }
 
     /// Radiance of the sky in linear sRGB.
     fn radiance(&self, direction: DVec3) -> [f64; 3] {
-        // At the horizon itself the formula divides by zero.
-        let cos_theta = direction.y.max(0.005);
+        let cos_theta = direction.y.max(self.cosine_min);
         let gamma = direction.dot(self.towards_sun).clamp(-1.0, 1.0).acos();
         let [luminance, x, y] =
             std::array::from_fn(|i| self.zenith[i] * formula(&self.perez[i], cos_theta, gamma));
@@ -219,24 +237,21 @@ fn formula([a, b, c, d, e]: &[f64; 5], cos_theta: f64, gamma: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Catches a sky that is not scaled, by integrating what a horizontal plate receives from map and sun.
+    /// Catches a sky that is not scaled: no plate may be brighter than 1, and one must nearly be.
     #[test]
-    fn a_white_plate_has_radiance_one_under_every_sky() {
+    fn the_brightest_white_plate_has_radiance_one_under_every_sky() {
         for (name, sky) in Sky::ALL {
-            let (map, sun) = render(sky, sky.sun_position());
-            let mut received = [0.0; 3];
-            for (direction, solid_angle, rgb) in map.samples() {
-                for (sum, value) in received.iter_mut().zip(rgb) {
-                    *sum += f64::from(value) * direction.y.max(0.0) * solid_angle;
-                }
-            }
-            if let Some(sun) = sun {
-                for (sum, value) in received.iter_mut().zip(sun.irradiance) {
-                    *sum += f64::from(value) * sun.direction.y;
-                }
-            }
-            let radiance = luminance(received) / std::f64::consts::PI;
-            assert!((radiance - 1.0).abs() < 1e-5, "{name}: {radiance}");
+            let position = sky.sun_position();
+            let (map, sun) = render(sky, position);
+            let strength = sun.map_or([0.0; 3], |sun| sun.irradiance.map(f64::from));
+            let radiance = |normal: DVec3| {
+                luminance(irradiance(&map, strength, position.direction(), normal)) / std::f64::consts::PI
+            };
+            let all = LatLong::from_fn(16, 8, |d| [radiance(d) as f32; 3]);
+            let most = all.samples().map(|(_, _, [value, ..])| value).fold(0.0, f32::max);
+            assert!((0.95..1.01).contains(&most), "{name}: {most}");
+            let under = radiance(DVec3::NEG_Y);
+            assert!(under > 0.01 && under < 0.19, "{name}: {under} from the ground");
         }
     }
 
@@ -253,7 +268,7 @@ mod tests {
         let far = DVec3::new(-sun.direction.x, 0.1, -sun.direction.z).normalize();
         assert!(map.radiance(near)[0] > 3.0 * map.radiance(far)[0]);
 
-        let preetham = Preetham::new(2.5, Sky::Clear.sun_position().direction());
+        let preetham = Preetham::new(Sky::Clear, Sky::Clear.sun_position().direction());
         let [r, g, b] = preetham.radiance(DVec3::Y);
         assert!((luminance([r, g, b]) - 6.2).abs() < 0.4, "{}", luminance([r, g, b]));
         assert!(b > g && g > r, "{r} {g} {b}");

@@ -39,7 +39,7 @@ fn open_hemisphere(normal: Vec3) -> [f32; 9] {
     // For a zonal function about n, coefficient (l, m) is f_l √(4π/(2l+1)) Y_lm(n).
     std::array::from_fn(|i| match i {
         0 => 1.772_454,
-        1..=3 => 1.534_990 * (4.0 * std::f32::consts::PI / 3.0).sqrt() * basis[i],
+        1..=3 => 1.534_99 * (4.0 * std::f32::consts::PI / 3.0).sqrt() * basis[i],
         _ => 0.0,
     })
 }

@@ -127,7 +127,7 @@ mod tests {
     fn a_white_furnace_is_white() {
         let open = open_hemisphere(|_| 1.0);
         assert!(
-            (open[0] - 1.772_454).abs() < 1e-5 && (open[2] - 1.534_990).abs() < 1e-5 && open[6].abs() < 1e-6
+            (open[0] - 1.772_454).abs() < 1e-5 && (open[2] - 1.534_99).abs() < 1e-5 && open[6].abs() < 1e-6
         );
         let environment = Environment::uniform([1.0, 0.5, 0.25]);
         for bands in 1..=6 {

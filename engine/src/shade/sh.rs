@@ -45,7 +45,7 @@ macro_rules! evaluation {
     ($(#[$doc:meta])* $name:ident, $scalar:ty, $vector:ty) => {
         $(#[$doc])*
         #[inline]
-        #[expect(clippy::excessive_precision, reason = "one table of constants serves both precisions")]
+        #[allow(clippy::excessive_precision, reason = "one table of constants serves both precisions")]
         pub fn $name(bands: usize, d: $vector, out: &mut [$scalar]) {
             assert!((1..=BANDS_MAX).contains(&bands), "{bands} bands, 1 to {BANDS_MAX} are possible");
             let out = &mut out[..bands * bands];
