@@ -192,7 +192,10 @@ fn shading(schema: &Schema, options: &RelightOptions) -> Result<Shading> {
 }
 
 /// The column of visibility coefficients: the one that is asked for, else the first that is named after occlusion.
-fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
+///
+/// # Errors
+/// [`ErrorKind::NotFound`] when there is none, [`ErrorKind::Invalid`] when the one asked for cannot be coefficients.
+pub fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
     const STANDARD: [&str; 8] = [
         names::NORMAL,
         names::RADIUS,
