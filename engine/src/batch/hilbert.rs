@@ -1,7 +1,9 @@
 //! The Hilbert curve in three dimensions: from a position to its place along the curve.
 //!
-//! The transform is J. Skilling's ("Programming the Hilbert curve", AIP Conference Proceedings 707, 2004), which walks
-//! from the coarsest bit to the finest, undoes the reflections and exchanges of each level and ends in a Gray code.
+//! The curve is J. Skilling's ("Programming the Hilbert curve", AIP Conference Proceedings 707, 2004). His procedure walks
+//! from the coarsest bit to the finest and exchanges or inverts axes on the way. What it has done to the axes so far is
+//! one of 96 states, so here a table made by the compiler gives for each state and octant the octant's place and the next
+//! state: one look-up per bit.
 
 use glam::DVec3;
 
@@ -41,27 +43,69 @@ impl HilbertCurve {
 /// Consecutive places are cells that share a side, and cells with the same leading bits are consecutive.
 fn index(cell: [u32; 3], bits: u32) -> u64 {
     debug_assert!((1..=BITS).contains(&bits) && cell.iter().all(|&x| x >> bits == 0));
-    let mut x = cell;
+    let octants = spread(cell[0]) << 2 | spread(cell[1]) << 1 | spread(cell[2]);
+    let (mut key, mut state) = (0, START);
+    for level in (0..bits).rev() {
+        let octant = (octants >> (3 * level) & 7) as usize;
+        let step = STEPS[8 * state + octant];
+        key = key << 3 | u64::from(step & 7);
+        state = usize::from(step >> 3);
+    }
+    key
+}
 
-    // Undo the reflections and exchanges, coarse levels first, without branches
-    for level in (1..bits).rev() {
-        let low = (1u32 << level) - 1;
-        for axis in 0..3 {
-            let set = 0u32.wrapping_sub(x[axis] >> level & 1);
-            let exchange = (x[0] ^ x[axis]) & low & !set;
-            x[0] ^= exchange | (low & set);
-            x[axis] ^= exchange;
-        }
+/// The orders in which the axes may stand.
+const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+
+/// Axes in their own order, none inverted, no parity.
+const START: usize = 0;
+
+/// For every state and octant the next state and, in the low three bits, the octant's place.
+const STEPS: [u16; 96 * 8] = {
+    let mut steps = [0; 96 * 8];
+    let mut i = 0;
+    while i < steps.len() {
+        steps[i] = step(i / 8, i % 8);
+        i += 1;
+    }
+    steps
+};
+
+/// One level of Skilling's procedure. A state is the order of the axes, which of them are inverted, and the parity of
+/// the third Gray code bits so far.
+const fn step(state: usize, octant: usize) -> u16 {
+    let (mut order, parity) = (ORDERS[state / 16], state & 1);
+    let mut inverted = [state >> 3 & 1, state >> 2 & 1, state >> 1 & 1];
+
+    // The octant's bits as the procedure finds them at this level
+    let mut bits = [0; 3];
+    let mut axis = 0;
+    while axis < 3 {
+        bits[axis] = (octant >> (2 - order[axis]) & 1) ^ inverted[axis];
+        axis += 1;
     }
 
-    // Gray encode
-    x[1] ^= x[0];
-    x[2] ^= x[1];
-    let flip =
-        (1..bits).fold(0, |flip, level| flip ^ (0u32.wrapping_sub(x[2] >> level & 1) & ((1 << level) - 1)));
+    // Their Gray code is the place
+    let gray = [bits[0], bits[0] ^ bits[1], bits[0] ^ bits[1] ^ bits[2]];
+    let place = (gray[0] ^ parity) << 2 | (gray[1] ^ parity) << 1 | (gray[2] ^ parity);
 
-    // The first axis holds the highest bit of each triple
-    spread(x[0] ^ flip) << 2 | spread(x[1] ^ flip) << 1 | spread(x[2] ^ flip)
+    // What happens to finer levels: inversion of the first axis, or exchange with it
+    axis = 0;
+    while axis < 3 {
+        if bits[axis] == 1 {
+            inverted[0] ^= 1;
+        } else {
+            (order[0], order[axis]) = (order[axis], order[0]);
+            (inverted[0], inverted[axis]) = (inverted[axis], inverted[0]);
+        }
+        axis += 1;
+    }
+    let mut number = 0;
+    while ORDERS[number][0] != order[0] || ORDERS[number][1] != order[1] {
+        number += 1;
+    }
+    let next = number * 16 + inverted[0] * 8 + inverted[1] * 4 + inverted[2] * 2 + (parity ^ gray[2]);
+    (next * 8 + place) as u16
 }
 
 /// Puts two zero bits between the bits of a number below 2^21.
@@ -149,7 +193,7 @@ mod tests {
     }
 
     proptest! {
-        /// Catches a slip in the branch-free form at the full 21 bits, where no exhaustive test reaches.
+        /// Catches a slip in the table at the full 21 bits, where no exhaustive test reaches.
         #[test]
         fn agrees_with_the_published_procedure(cell in prop::array::uniform3(0u32..1 << BITS)) {
             prop_assert_eq!(index(cell, BITS), published(cell, BITS));

@@ -334,20 +334,18 @@ fn bounds_of(points: &[Point]) -> Bounds {
 fn finish_batch(points: &[Point], curve: &HilbertCurve) -> (Leaf, Vec<u8>) {
     let bounds = bounds_of(points);
     let inner = HilbertCurve::new(&bounds);
-    let mut order: Vec<(u64, u64, u32)> = points
-        .iter()
-        .enumerate()
-        .map(|(place, point)| (inner.key(point.position), point.index, place as u32))
-        .collect();
-    order.sort_unstable();
+    let mut order: Vec<(u64, u32)> =
+        (0..).zip(points).map(|(place, point)| (inner.key(point.position), place)).collect();
+    let index = |place: u32| points[place as usize].index;
+    order.sort_unstable_by(|a, b| a.0.cmp(&b.0).then_with(|| index(a.1).cmp(&index(b.1))));
 
     let mut bytes = Vec::with_capacity(points.len() * Point::BYTES);
     let (mut sum, mut first_index) = (DVec3::ZERO, u64::MAX);
-    for &(_, index, place) in &order {
+    for &(_, place) in &order {
         let point = &points[place as usize];
         bytes.extend_from_slice(&point.to_bytes());
         sum += point.position - bounds.min;
-        first_index = first_index.min(index);
+        first_index = first_index.min(point.index);
     }
     let centroid = bounds.min + sum / points.len() as f64;
     let record = Record { leaf: 0, count: points.len() as u32, hash: xxh3_64(&bytes), bounds };

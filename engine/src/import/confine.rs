@@ -10,9 +10,12 @@ use crate::{Error, Result};
 /// Invalid when the name is absolute, goes up, or leads out of the folder by a link; not found when nothing is there.
 pub(super) fn beside(path: &Path, name: &str) -> Result<PathBuf> {
     let refuse = || {
-        Error::invalid(format!("`{}` does not lie in the folder of the file that names it", name.escape_debug()))
-            .at(path)
-            .hint("put the files side by side and name them without `..` or a leading `/`")
+        Error::invalid(format!(
+            "`{}` does not lie in the folder of the file that names it",
+            name.escape_debug()
+        ))
+        .at(path)
+        .hint("put the files side by side and name them without `..` or a leading `/`")
     };
     // Exporters on Windows write backslashes
     let name = name.replace('\\', "/");
@@ -50,7 +53,9 @@ mod tests {
         std::fs::write(folder.path().join("inside/textures/a.png"), b"x").unwrap();
         assert!(beside(&scene, "textures/a.png").is_ok() && beside(&scene, ".\\textures\\a.png").is_ok());
         let absolute = folder.path().join("outside.bin");
-        for name in ["../outside.bin", "textures/../../outside.bin", absolute.to_str().unwrap(), "", "C:x", "a\0"] {
+        for name in
+            ["../outside.bin", "textures/../../outside.bin", absolute.to_str().unwrap(), "", "C:x", "a\0"]
+        {
             assert_eq!(beside(&scene, name).unwrap_err().kind(), ErrorKind::Invalid, "{name}");
         }
         assert_eq!(beside(&scene, "b.png").unwrap_err().kind(), ErrorKind::NotFound);

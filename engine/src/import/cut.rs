@@ -59,7 +59,8 @@ impl VertexKey {
     }
 
     fn hash(&self) -> usize {
-        let mixed = (self.position_normal ^ self.material_opacity.rotate_left(17)) ^ self.position_normal >> 29;
+        let mixed =
+            (self.position_normal ^ self.material_opacity.rotate_left(17)) ^ self.position_normal >> 29;
         (mixed.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 48) as usize
     }
 }
@@ -319,5 +320,154 @@ fn partition(items: &mut [Item], is_left: impl Fn(&Item) -> bool) -> usize {
             return left;
         }
         items.swap(left, right - 1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::import::ImportReport;
+    use crate::math::Bounds;
+
+    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+
+    /// A wavy sheet of `n` by `n` quads in file order by rows.
+    fn sheet(n: u32) -> Mesh {
+        let mut mesh = Mesh::default();
+        let mut report = ImportReport::default();
+        for i in 0..(n + 1) * (n + 1) {
+            let (x, y) = (f64::from(i % (n + 1)), f64::from(i / (n + 1)));
+            mesh.positions.push(DVec3::new(x, y, 0.02 * (x * y) % 7.0));
+        }
+        for i in 0..n * n {
+            let at = i / n * (n + 1) + i % n;
+            mesh.push_face(FACE, &[at, at + 1, at + n + 2, at + n + 1], &mut report).unwrap();
+        }
+        mesh.finish(&mut report).unwrap();
+        mesh
+    }
+
+    /// `count` separate triangles scattered by a fixed rule.
+    fn soup(count: u32) -> Mesh {
+        let mut mesh = Mesh::default();
+        let mut report = ImportReport::default();
+        let unit = |hash: u32| f64::from(crate::math::hash::unit_f32(crate::math::hash::hash32(hash)));
+        for i in 0..count {
+            let at = DVec3::new(unit(3 * i), unit(3 * i + 1), unit(3 * i + 2)) * 100.0;
+            mesh.positions.extend([at, at + DVec3::X, at + DVec3::Y]);
+            mesh.push_face(Face { object: i % 2, ..FACE }, &[3 * i, 3 * i + 1, 3 * i + 2], &mut report)
+                .unwrap();
+        }
+        mesh.finish(&mut report).unwrap();
+        mesh
+    }
+
+    /// Mean vertices per cluster, after checking that every face is in one cluster that fits a grid.
+    fn check(mesh: &Mesh) -> (Clusters, f64) {
+        let clusters = cut(mesh);
+        let mut seen = vec![false; mesh.faces.len()];
+        let mut table = VertexTable::new();
+        let (mut vertices, mut count) = (0, 0);
+        for cluster in clusters.iter() {
+            table.clear();
+            for &index in cluster {
+                assert!(!std::mem::replace(&mut seen[index as usize], true), "face {index} twice");
+                let face = &mesh.faces[index as usize];
+                (face.start..face.start + face.arity)
+                    .for_each(|corner| _ = table.add(VertexKey::new(mesh, face, corner as usize)));
+            }
+            let objects = cluster.iter().map(|&face| mesh.faces[face as usize].object);
+            assert_eq!(objects.clone().min(), objects.max());
+            assert!((1..=VERTICES_MAX).contains(&table.count), "{} vertices", table.count);
+            vertices += table.count;
+            count += 1;
+        }
+        assert!(seen.iter().all(|&seen| seen));
+        (clusters, vertices as f64 / f64::from(count))
+    }
+
+    /// Catches a face that is lost, twice, or in a cluster that does not fit; clusters that are strips or half empty.
+    #[test]
+    fn clusters_are_full_and_compact() {
+        let mesh = sheet(300);
+        let (clusters, vertices) = check(&mesh);
+        let edges: Vec<(f64, f64)> = (clusters.iter())
+            .map(|cluster| {
+                let mut bounds = Bounds::EMPTY;
+                for &face in cluster {
+                    let corners = mesh.face_corners(&mesh.faces[face as usize]);
+                    corners.iter().for_each(|&c| bounds.add(mesh.positions[c as usize]));
+                }
+                (bounds.size().x + bounds.size().y, cluster.len() as f64)
+            })
+            .collect();
+        // How much longer the outline is than that of a square of as many quads
+        let stretch =
+            edges.iter().map(|(edge, faces)| edge / (2.0 * faces.sqrt())).sum::<f64>() / edges.len() as f64;
+        eprintln!(
+            "sheet: {} clusters, {vertices:.0} vertices, outline {stretch:.2} of a square",
+            edges.len()
+        );
+        assert!(vertices > 140.0 && stretch < 1.2);
+
+        let (_, vertices) = check(&soup(30_000));
+        eprintln!("soup: {vertices:.0} vertices");
+        assert!(vertices > 140.0);
+    }
+
+    /// Catches recursion without end, or an empty part, where all faces lie in one place or on a line.
+    #[test]
+    fn coinciding_faces_are_cut_too() {
+        for step in [0.0, 1e-30, 1.0, 1e25] {
+            let mut mesh = soup(5000);
+            mesh.positions
+                .iter_mut()
+                .enumerate()
+                .for_each(|(i, p)| *p = DVec3::new(step * (i / 9) as f64, 0.0, 0.0));
+            check(&mesh);
+        }
+        assert_eq!(cut(&Mesh::default()).iter().count(), 0);
+    }
+
+    /// Catches clusters that depend on the number of threads.
+    #[test]
+    fn threads_do_not_change_clusters() {
+        let mesh = soup(200_000);
+        let cut_with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let clusters = pool.install(|| cut(&mesh));
+            (clusters.faces, clusters.ends)
+        };
+        assert!(cut_with(1) == cut_with(3));
+    }
+
+    /// Prints the rate for ten million faces; run by hand.
+    #[test]
+    #[ignore = "takes gigabytes and half a minute"]
+    fn rate() {
+        let mesh = sheet(3163);
+        let start = std::time::Instant::now();
+        let clusters = cut(&mesh);
+        let seconds = start.elapsed().as_secs_f64();
+        let faces = mesh.faces.len() as f64;
+        eprintln!("{faces} faces, {} clusters: {:.2} M faces/s", clusters.ends.len(), faces / seconds / 1e6);
+        struct Null;
+        impl crate::import::GridSink for Null {
+            fn begin(&mut self, _: &crate::stream::Schema) -> crate::Result<()> {
+                Ok(())
+            }
+            fn grid(&mut self, _: &crate::stream::Microgrid) -> crate::Result<()> {
+                Ok(())
+            }
+        }
+        use crate::import::emit::{Carried, Emitter, Placement};
+        let mut sink = Null;
+        let mut emitter = Emitter::new(&mut sink, Carried::by(&mesh), &Default::default()).unwrap();
+        let start = std::time::Instant::now();
+        let mut report = ImportReport::default();
+        emitter.emit(&mesh, &clusters, &Placement::HERE, (0, 0.0), &mut report).unwrap();
+        eprintln!("emitted at {:.2} M faces/s", faces / start.elapsed().as_secs_f64() / 1e6);
     }
 }

@@ -165,7 +165,7 @@ impl<'a> Emitter<'a> {
             let id = first_id.wrapping_add(mesh.faces[cluster[0] as usize].object);
             let column = self.schema.attributes.len() - 1;
             self.grid.columns[column].extend_from_slice(&id.to_le_bytes());
-            debug_assert!(self.grid.validate(&self.schema).is_ok(), "{:?}", self.grid.validate(&self.schema));
+            debug_assert_eq!(self.grid.validate(&self.schema).err().map(|e| e.to_string()), None);
             report.grids += 1;
             report.micropolygons += self.grid.face_count() as u64;
             report.vertices += self.grid.vertex_count() as u64;
@@ -316,7 +316,7 @@ pub(super) fn default_radius(mesh: &Mesh, meters_per_unit: f64) -> f32 {
 /// Warns that points or lines got a radius that nobody gave.
 pub(super) fn warn_radius(mesh: &Mesh, radius: f32, report: &mut ImportReport) {
     if mesh.radii.is_empty() && mesh.has_radii() {
-        report.warn(format!("points or lines without a radius were given `{radius:.4}`"));
+        report.warn(format!("points or lines without a radius were given `{radius}`"));
     }
 }
 
@@ -324,4 +324,102 @@ pub(super) fn warn_radius(mesh: &Mesh, radius: f32, report: &mut ImportReport) {
 pub(super) fn opacity_byte(opacity: f32) -> u8 {
     let byte = srgb::unit_byte(opacity);
     if opacity > 0.0 { byte.max(1) } else { byte }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::import::assets::Collect;
+    use crate::import::cut;
+    use std::collections::BTreeMap;
+
+    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+
+    /// A bumpy sheet of `n` by `n` quads, of decimals that single precision does not hold.
+    fn sheet(n: u32) -> Mesh {
+        let mut mesh = Mesh::default();
+        let mut report = ImportReport::default();
+        for i in 0..(n + 1) * (n + 1) {
+            let (x, y) = (f64::from(i % (n + 1)), f64::from(i / (n + 1)));
+            mesh.positions.push(DVec3::new(0.1 * x, 0.1 * y, 0.0007 * ((x * 7.0 + y * 3.0) % 5.0)));
+        }
+        for i in 0..n * n {
+            let at = i / n * (n + 1) + i % n;
+            mesh.push_face(FACE, &[at, at + 1, at + n + 2, at + n + 1], &mut report).unwrap();
+        }
+        mesh.finish(&mut report).unwrap();
+        mesh
+    }
+
+    fn emit(mesh: &Mesh, placement: &Placement) -> Collect {
+        let mut sink = Collect::default();
+        let mut emitter = Emitter::new(&mut sink, Carried::by(mesh), &Default::default()).unwrap();
+        emitter.emit(mesh, &cut::cut(mesh), placement, (0, 0.0), &mut ImportReport::default()).unwrap();
+        sink
+    }
+
+    /// Catches a shared vertex that is another number in the next grid: a crack, and a false hit from its own corner.
+    #[test]
+    fn shared_vertices_are_equal_in_all_grids() {
+        let far = DMat4::from_translation(DVec3::new(4e6, -3e5, 12.0))
+            * DMat4::from_rotation_y(0.3)
+            * DMat4::from_scale(DVec3::splat(0.731));
+        for placement in [Placement::HERE, Placement::new(far).unwrap()] {
+            let mesh = sheet(60);
+            let sink = emit(&mesh, &placement);
+            let mut known = BTreeMap::new();
+            for grid in &sink.grids {
+                for vertex in 0..grid.vertex_count() {
+                    let p = grid.position(vertex);
+                    let near = (p * 100.0).round().to_array().map(|x| x as i64);
+                    assert_eq!(*known.entry(near).or_insert(p), p);
+                }
+            }
+            assert_eq!(known.len(), mesh.positions.len());
+            assert!(sink.grids.len() > 10);
+        }
+    }
+
+    /// Catches normals that point to the other side of their faces after a mirror or a scale that is not uniform.
+    #[test]
+    fn normals_follow_their_faces() {
+        for scale in [DVec3::new(1.0, 1.0, 1.0), DVec3::new(-2.0, 0.3, 5.0), DVec3::new(-1.0, -1.0, -4.0)] {
+            let placement = Placement::new(DMat4::from_rotation_x(1.0) * DMat4::from_scale(scale)).unwrap();
+            let sink = emit(&sheet(12), &placement);
+            for grid in &sink.grids {
+                for face in grid.faces() {
+                    let points: Vec<DVec3> = face.iter().map(|&v| grid.position(usize::from(v))).collect();
+                    let normal = polygon::area_normal(&points).normalize();
+                    for &vertex in face {
+                        let own = grid.vec3(&sink.schema, 0, usize::from(vertex)).as_dvec3();
+                        assert!(
+                            (own.length() - 1.0).abs() < 1e-6 && own.dot(normal) > 0.0,
+                            "{scale} {own} {normal}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    /// Catches a placement that divides by zero or spreads what is not a number.
+    #[test]
+    fn flat_and_broken_placements_are_refused() {
+        assert!(Placement::new(DMat4::from_scale(DVec3::new(1.0, 0.0, 1.0))).is_none());
+        assert!(Placement::new(DMat4::from_scale(DVec3::splat(f64::NAN))).is_none());
+        assert!(Placement::new(DMat4::from_translation(DVec3::splat(f64::INFINITY))).is_none());
+    }
+
+    /// Catches a rounding step that a grid cannot hold in single precision, at every power of two.
+    #[test]
+    fn the_step_of_a_grid_is_fine_and_fits() {
+        for exponent in -100..100 {
+            for share in [1.0, 1.5, 1.999] {
+                let size = share * power_of_two(exponent);
+                let steps = size / power_of_two(resolution(size));
+                assert!((2_f64.powi(23)..=2_f64.powi(24)).contains(&steps), "{size} {steps}");
+            }
+        }
+        assert_eq!(resolution(0.0), EXPONENT_MIN);
+    }
 }

@@ -49,7 +49,12 @@ fn bad_faces_are_counted_and_the_rest_is_read() {
     for (name, left, skipped) in [("not_finite.ply", 1, 2), ("not_finite.obj", 1, 2), ("no_end.obj", 1, 0)] {
         let (sink, report) = collect(&data(name)).unwrap();
         assert_eq!(report.micropolygons, left, "{name}");
-        assert_eq!(report.skipped.iter().map(|skip| skip.1).sum::<u64>(), skipped, "{name}: {:?}", report.skipped);
+        assert_eq!(
+            report.skipped.iter().map(|skip| skip.1).sum::<u64>(),
+            skipped,
+            "{name}: {:?}",
+            report.skipped
+        );
         assert!(sink.bounds().size().is_finite());
     }
 }
@@ -145,7 +150,10 @@ proptest! {
 #[test]
 fn samples_are_read_as_written() {
     let (sink, report) = collect(&data("groups.obj")).unwrap();
-    assert_eq!((report.source.quads, report.source.ngons, report.source.lines, report.source.points), (2, 1, 2, 1));
+    assert_eq!(
+        (report.source.quads, report.source.ngons, report.source.lines, report.source.points),
+        (2, 1, 2, 1)
+    );
     let ids: std::collections::BTreeSet<u32> = sink.values("id").iter().map(|&id| id as u32).collect();
     assert_eq!(ids.len(), 2);
     assert_eq!(sink.values("radius").iter().filter(|&&radius| radius > 0.0).count(), 4);

@@ -54,10 +54,10 @@ pub(super) struct Mesh {
 }
 
 impl Mesh {
-    /// Bytes that a mesh of these counts takes at its peak, while it is cut: positions, their normals of both kinds
-    /// and attributes; corners with normal indices; faces, the cutter's items and its clusters.
+    /// Bytes that a mesh of these counts takes at its peak: positions, normals of both kinds and the sums they are
+    /// made of, attributes; corners with normal indices; faces, the cutter's items and its clusters.
     pub fn bytes(vertices: u64, corners: u64, faces: u64) -> u64 {
-        let per_vertex = vertices.saturating_mul(24 + 12 + 24 + 12 + 4);
+        let per_vertex = vertices.saturating_mul(24 + 12 + 12 + 24 + 4 + 8);
         per_vertex.saturating_add(corners.saturating_mul(8)).saturating_add(faces.saturating_mul(20 + 16 + 5))
     }
 
@@ -110,7 +110,8 @@ impl Mesh {
 
     /// Whether any vertex lets light through.
     pub fn has_opacity(&self) -> bool {
-        self.opacities.iter().any(|&opacity| opacity < 255) || self.faces.iter().any(|face| face.opacity < 255)
+        self.opacities.iter().any(|&opacity| opacity < 255)
+            || self.faces.iter().any(|face| face.opacity < 255)
     }
 
     /// Drops faces that cannot be used, turns polygons of more than four corners into triangles, turns quads whose
@@ -257,8 +258,7 @@ mod tests {
 
     fn mesh(positions: &[[f64; 3]], faces: &[&[u32]]) -> (Mesh, ImportReport) {
         let mut report = ImportReport::default();
-        let mut mesh =
-            Mesh { positions: positions.iter().map(|&p| p.into()).collect(), ..Mesh::default() };
+        let mut mesh = Mesh { positions: positions.iter().map(|&p| p.into()).collect(), ..Mesh::default() };
         for face in faces {
             mesh.push_face(FACE, face, &mut report).unwrap();
         }

@@ -1,7 +1,7 @@
 //! Import: PLY, OBJ and glTF become compact microgrids, handed to a sink one by one (`docs/import.md`).
 //!
-//! Each format leaves an indexed [`mesh`] in memory; [`polygon`] turns what has more than four corners into
-//! triangles, [`cut`] parts the faces into clusters of at most 256 vertices, [`emit`] writes them out as microgrids.
+//! Each format leaves an indexed `mesh` in memory; `polygon` turns what has more than four corners into
+//! triangles, `cut` parts the faces into clusters of at most 256 vertices, `emit` writes them out as microgrids.
 //! Nothing is allocated because a file says so: lengths are checked against the file's size, and the memory that a
 //! file needs is computed and compared with [`ImportOptions::memory_bytes`] before it is taken.
 

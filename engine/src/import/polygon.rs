@@ -201,7 +201,8 @@ mod tests {
     /// Catches an arrowhead that would be split along the diagonal outside it.
     #[test]
     fn arrowheads_start_at_their_notch() {
-        let notch_at_1 = [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 0.0, 0.0], [1.0, 4.0, 0.0]].map(DVec3::from);
+        let notch_at_1 =
+            [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 0.0, 0.0], [1.0, 4.0, 0.0]].map(DVec3::from);
         assert_eq!(quad_diagonal(&notch_at_1), Some(1));
         let mut notch_at_0 = notch_at_1;
         notch_at_0.rotate_left(1);

@@ -3,7 +3,8 @@
 use std::sync::LazyLock;
 
 /// Linear light of every sRGB byte (IEC 61966-2-1).
-static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|i| decode(i as f64 / 255.0) as f32));
+static LINEAR: LazyLock<[f32; 256]> =
+    LazyLock::new(|| std::array::from_fn(|i| decode(i as f64 / 255.0) as f32));
 
 /// The linear value, 0 to 1, of an sRGB byte.
 pub(super) fn linear(byte: u8) -> f32 {
@@ -44,8 +45,7 @@ mod tests {
     fn bytes_follow_the_standard_curve() {
         for byte in 0..=255_u8 {
             let value = f64::from(byte) / 255.0;
-            let expected =
-                if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) };
+            let expected = if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) };
             assert!((f64::from(linear(byte)) - expected).abs() < 1e-7, "byte {byte}");
         }
         assert_eq!([unit_byte(0.5), unit_byte(f32::NAN), unit_byte(7.0)], [128, 0, 255]);

@@ -81,8 +81,12 @@ pub(super) fn fault(accessor: &Accessor, view: Option<(u64, Option<u64>)>) -> Op
     let Some((length, stride)) = view else {
         return (accessor.byte_offset > 0).then(|| "has an offset, but no buffer view".into());
     };
-    let layout =
-        Layout::new((component, size), (accessor.byte_offset, stride), accessor.count, usize::try_from(length).ok()?);
+    let layout = Layout::new(
+        (component, size),
+        (accessor.byte_offset, stride),
+        accessor.count,
+        usize::try_from(length).ok()?,
+    );
     layout.is_none().then(|| format!("does not fit its buffer view of {length} bytes"))
 }
 
@@ -190,18 +194,22 @@ impl Container {
         let wrong = |what: &str| Error::invalid(format!("accessor {accessor} {what}"));
         let components = outline.kind.1;
         let total = outline.count.saturating_mul(components as u64);
-        let convert =
-            |kind: Component, bytes: &[u8]| convert(kind, outline.normalized, bytes).ok_or_else(|| wrong("has components of the wrong type"));
-        // A view bounds the count by its bytes; without one elements are zero and the budget alone bounds them
-        let layout = match outline.view {
-            Some(view) => {
-                let (bytes, stride) = self.view(view)?;
-                let length = bytes.len();
-                let layout = Layout::new(outline.kind, (outline.offset, stride), outline.count, length);
-                Some(layout.ok_or_else(|| wrong(&format!("does not fit buffer view {view} of {length} bytes")))?)
-            }
-            None => None,
+        let convert = |kind: Component, bytes: &[u8]| {
+            convert(kind, outline.normalized, bytes).ok_or_else(|| wrong("has components of the wrong type"))
         };
+        // A view bounds the count by its bytes; without one elements are zero and the budget alone bounds them
+        let layout =
+            match outline.view {
+                Some(view) => {
+                    let (bytes, stride) = self.view(view)?;
+                    let length = bytes.len();
+                    let layout = Layout::new(outline.kind, (outline.offset, stride), outline.count, length);
+                    Some(layout.ok_or_else(|| {
+                        wrong(&format!("does not fit buffer view {view} of {length} bytes"))
+                    })?)
+                }
+                None => None,
+            };
         self.budget.take(total.saturating_mul(size_of::<T>() as u64), &format!("accessor {accessor}"))?;
         let mut values = Vec::new();
         match (layout, outline.view) {
@@ -215,12 +223,15 @@ impl Container {
             _ => values.resize(total as usize, T::default()),
         }
         if let Some(sparse) = outline.sparse {
-            let places = self.sparse_places(&sparse, outline.count).map_err(|what| what.unwrap_or_else(|| wrong("has sparse indices that are not in range")))?;
+            let places = self
+                .sparse_places(&sparse, outline.count)
+                .map_err(|what| what.unwrap_or_else(|| wrong("has sparse indices that are not in range")))?;
             let (bytes, _) = self.view(sparse.values.0)?;
             let layout = Layout::new(outline.kind, (sparse.values.1, None), sparse.count, bytes.len())
                 .ok_or_else(|| wrong("has sparse values that do not fit their view"))?;
             for (i, bytes) in layout.each(bytes).enumerate() {
-                values[places[i / components] * components + i % components] = convert(layout.component, bytes)?;
+                values[places[i / components] * components + i % components] =
+                    convert(layout.component, bytes)?;
             }
         }
         Ok((values, components))
@@ -235,7 +246,8 @@ impl Container {
         let accessors = &self.document.accessors;
         let found = accessors.get(accessor).ok_or_else(|| missing("accessor", accessor, accessors.len()))?;
         let wrong = |what: String| Error::invalid(format!("accessor {accessor} {what}"));
-        let component = |code| Component::of(code).ok_or_else(|| wrong(format!("has the component type `{code}`")));
+        let component =
+            |code| Component::of(code).ok_or_else(|| wrong(format!("has the component type `{code}`")));
         let shape = components(&found.shape).filter(|shape| shapes.contains(shape));
         let shape = shape.ok_or_else(|| wrong(format!("has the type `{}`", found.shape.escape_debug())))?;
         if found.count == 0 {

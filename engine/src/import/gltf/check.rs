@@ -8,7 +8,11 @@ use crate::{Error, Result};
 /// Checks what the import relies on.
 pub(super) fn check(document: &Document) -> Result<()> {
     check_buffers(document)?;
-    document.accessors.iter().enumerate().try_for_each(|(i, accessor)| check_accessor(document, i, accessor))?;
+    document
+        .accessors
+        .iter()
+        .enumerate()
+        .try_for_each(|(i, accessor)| check_accessor(document, i, accessor))?;
     document.meshes.iter().enumerate().try_for_each(|(i, mesh)| check_mesh(document, i, mesh))?;
     check_materials(document)?;
     check_nodes(document)
@@ -133,8 +137,10 @@ fn check_nodes(document: &Document) -> Result<()> {
         for &child in &node.children {
             within("node", Some(child), nodes)?;
             if std::mem::replace(&mut parents[child], index) != usize::MAX {
-                return Err(Error::invalid(format!("node {child} is reached twice: the nodes are not a tree"))
-                    .hint("a node may have one parent; copies are made by nodes that share a mesh"));
+                return Err(Error::invalid(format!(
+                    "node {child} is reached twice: the nodes are not a tree"
+                ))
+                .hint("a node may have one parent; copies are made by nodes that share a mesh"));
             }
         }
     }
@@ -149,5 +155,9 @@ fn check_nodes(document: &Document) -> Result<()> {
         return Err(Error::invalid("a node is its own ancestor: the nodes are not a tree"));
     }
     within("scene", document.scene, document.scenes.len())?;
-    document.scenes.iter().flat_map(|scene| &scene.nodes).try_for_each(|&node| within("node", Some(node), nodes))
+    document
+        .scenes
+        .iter()
+        .flat_map(|scene| &scene.nodes)
+        .try_for_each(|&node| within("node", Some(node), nodes))
 }

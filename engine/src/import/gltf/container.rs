@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use super::document::{Document, Extensions};
+use super::document::Document;
 use crate::import::budget::Budget;
 use crate::import::confine;
 use crate::{Error, ErrorKind, Result};
@@ -18,13 +18,16 @@ const READABLE: [&str; 5] = [
     "KHR_lights_punctual",
 ];
 
+/// Where a chunk lies in a GLB: offset and length in bytes.
+type Chunk = (u64, u64);
+
 /// An asset: its document and its buffers, each loaded when first asked for.
 pub(super) struct Container {
     pub path: PathBuf,
     pub document: Document,
     pub budget: Budget,
-    /// Where the binary chunk lies in a GLB: offset and length.
-    chunk: Option<(u64, u64)>,
+    /// The binary chunk of a GLB.
+    chunk: Option<Chunk>,
     buffers: Vec<Option<Vec<u8>>>,
 }
 
@@ -56,7 +59,11 @@ impl Container {
     pub fn view(&mut self, view: usize) -> Result<(&[u8], Option<u64>)> {
         let views = &self.document.buffer_views;
         let found = views.get(view).ok_or_else(|| missing("buffer view", view, views.len()))?;
-        refuse_compressed(&found.extensions, "buffer view", view)?;
+        let has_bytes = found.buffer == 0 && self.chunk.is_some()
+            || self.document.buffers.get(found.buffer).is_some_and(|buffer| buffer.uri.is_some());
+        if let Some(name) = found.extensions.keys().find(|name| name.contains("meshopt") && !has_bytes) {
+            return Err(unsupported(name));
+        }
         let (buffer, stride) = (found.buffer, found.byte_stride);
         let range = (found.byte_offset, found.byte_length);
         self.load(buffer)?;
@@ -115,31 +122,11 @@ pub(super) fn missing(what: &str, index: usize, count: usize) -> Error {
     Error::invalid(format!("{what} {index} of {count}, which count from 0"))
 }
 
-/// Refuses data that is there in compressed form only.
-pub(super) fn refuse_compressed(extensions: &Extensions, what: &str, index: usize) -> Result<()> {
-    let compressed = |name: &&String| name.contains("meshopt") || name.contains("draco");
-    match extensions.keys().find(compressed) {
-        Some(name) => Err(unsupported(name).at_item(what, index)),
-        None => Ok(()),
-    }
-}
-
 /// The error for an extension that cannot be read.
 pub(super) fn unsupported(name: &str) -> Error {
     let name: String = name.chars().take(80).collect();
     Error::unsupported(format!("the glTF extension `{}` is not supported", name.escape_debug()))
         .hint("export again without this extension, or convert the file with another program")
-}
-
-trait AtItem {
-    fn at_item(self, what: &str, index: usize) -> Self;
-}
-
-impl AtItem for Error {
-    fn at_item(self, what: &str, index: usize) -> Self {
-        let message = format!("{what} {index}: {}", self.message());
-        Error::new(self.kind(), message).hint(self.hint_text().unwrap_or_default())
-    }
 }
 
 /// Reads the chunks of a GLB: the document, and where the binary chunk lies.
@@ -148,7 +135,7 @@ fn read_binary(
     path: &Path,
     length: u64,
     budget: &mut Budget,
-) -> Result<(Vec<u8>, Option<(u64, u64)>)> {
+) -> Result<(Vec<u8>, Option<Chunk>)> {
     let io = |e| Error::io("read the file", path, e);
     let word = |file: &mut File| -> Result<u64> {
         let mut bytes = [0; 4];
@@ -157,7 +144,9 @@ fn read_binary(
     };
     let [_, version, stated] = [word(file)?, word(file)?, word(file)?];
     if version != 2 {
-        return Err(Error::unsupported(format!("GLB version {version}, version 2 can be read")).at_byte(path, 4));
+        return Err(
+            Error::unsupported(format!("GLB version {version}, version 2 can be read")).at_byte(path, 4)
+        );
     }
     if stated > length {
         let message = format!("the header says {stated} bytes, the file has {length}");
@@ -232,7 +221,9 @@ fn whole_numbers(value: serde_json::Value) -> serde_json::Value {
     use serde_json::Value;
     match value {
         Value::Number(number) => match number.as_f64() {
-            Some(x) if number.is_f64() && x.fract() == 0.0 && (0.0..9e15).contains(&x) => Value::from(x as u64),
+            Some(x) if number.is_f64() && x.fract() == 0.0 && (0.0..9e15).contains(&x) => {
+                Value::from(x as u64)
+            }
             _ => Value::Number(number),
         },
         Value::Array(values) => values.into_iter().map(whole_numbers).collect(),
@@ -277,8 +268,8 @@ fn read_uri(path: &Path, uri: &str, length: Option<u64>, budget: &mut Budget, wh
             .split_once(";base64,")
             .ok_or_else(|| Error::invalid(format!("{what} has a data URI that is not base64")))?;
         budget.take(text.len() as u64 / 4 * 3, what)?;
-        let mut bytes =
-            base64(text).ok_or_else(|| Error::invalid(format!("{what} has broken base64 in its data URI")))?;
+        let mut bytes = base64(text)
+            .ok_or_else(|| Error::invalid(format!("{what} has broken base64 in its data URI")))?;
         if let Some(length) = length {
             if (bytes.len() as u64) < length {
                 let message = format!("{what} has {} bytes in its data URI, {length} expected", bytes.len());

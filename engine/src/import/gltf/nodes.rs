@@ -84,7 +84,8 @@ fn world_from_gltf(options: &ImportOptions) -> DMat4 {
 fn roots(container: &Container, report: &mut ImportReport) -> Result<Vec<usize>> {
     let document = &container.document;
     if let Some(scene) = document.scene.or((!document.scenes.is_empty()).then_some(0)) {
-        let found = document.scenes.get(scene).ok_or_else(|| missing("scene", scene, document.scenes.len()))?;
+        let found =
+            document.scenes.get(scene).ok_or_else(|| missing("scene", scene, document.scenes.len()))?;
         return Ok(found.nodes.clone());
     }
     let mut is_child = vec![false; document.nodes.len()];
@@ -163,7 +164,8 @@ fn instances(container: &mut Container, node: usize, extension: &serde_json::Val
     };
     let matrices = (0..count)
         .map(|i| {
-            let rotation = rotations.as_ref().map(|values| std::array::from_fn(|k| f64::from(values[4 * i + k])));
+            let rotation =
+                rotations.as_ref().map(|values| std::array::from_fn(|k| f64::from(values[4 * i + k])));
             // A rotation of no direction makes the copy's matrix not finite, and so a counted skip
             let rotation = rotation.map_or(DQuat::IDENTITY, |r| unit_rotation(r).unwrap_or(DQuat::NAN));
             let (scale, translation) = (three(scales, i, DVec3::ONE), three(translations, i, DVec3::ZERO));

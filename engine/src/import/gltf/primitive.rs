@@ -151,7 +151,8 @@ fn push_faces(
         Some(accessor) => {
             let order = container.indices(accessor)?;
             if let Some((i, index)) = order.iter().enumerate().find(|&(_, &index)| index >= vertices) {
-                let message = format!("accessor {accessor}, element {i}: vertex {index} of {vertices} vertices");
+                let message =
+                    format!("accessor {accessor}, element {i}: vertex {index} of {vertices} vertices");
                 return Err(Error::invalid(message));
             }
             order
@@ -232,7 +233,8 @@ fn paint(
         }
         _ => None,
     };
-    let mut sums = vec![[0.0_f32; 4]; if averager.is_some() && with_albedo { mesh.positions.len() } else { 0 }];
+    let mut sums =
+        vec![[0.0_f32; 4]; if averager.is_some() && with_albedo { mesh.positions.len() } else { 0 }];
     let mut faces = std::mem::take(&mut mesh.faces);
     for face in &mut faces {
         let corners = mesh.face_corners(face);

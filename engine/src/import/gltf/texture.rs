@@ -88,7 +88,8 @@ impl Images {
     ) -> Result<Option<Texture>> {
         let document = &container.document;
         let textures = document.textures.len();
-        let texture = document.textures.get(info.index).ok_or_else(|| missing("texture", info.index, textures))?;
+        let texture =
+            document.textures.get(info.index).ok_or_else(|| missing("texture", info.index, textures))?;
         let sampler = match texture.sampler {
             Some(sampler) => {
                 let found = document.samplers.get(sampler);
@@ -97,7 +98,10 @@ impl Images {
             None => Default::default(),
         };
         let Some(image) = texture.source else {
-            report.warn(format!("texture {} has no image that can be read: its material keeps its factor", info.index));
+            report.warn(format!(
+                "texture {} has no image that can be read: its material keeps its factor",
+                info.index
+            ));
             return Ok(None);
         };
         if !self.loaded.iter().any(|(known, _)| *known == image) {
@@ -110,7 +114,12 @@ impl Images {
             }
         }
         let (set, transform) = transform(info);
-        Ok(Some(Texture { image, wrap: [Wrap::of(sampler.wrap_s), Wrap::of(sampler.wrap_t)], set, transform }))
+        Ok(Some(Texture {
+            image,
+            wrap: [Wrap::of(sampler.wrap_s), Wrap::of(sampler.wrap_t)],
+            set,
+            transform,
+        }))
     }
 
     /// Keeps an image, and drops the oldest while all together take more than half of the memory allowed.
@@ -151,7 +160,7 @@ fn transform(info: &TextureInfo) -> (u32, Option<(Vec2, Vec2, Vec2)>) {
 fn direction(angle: f64) -> Vec2 {
     let turn = std::f64::consts::TAU;
     let x = angle - (angle / turn).round() * turn;
-    if !(x.abs() <= 4.0) {
+    if !x.is_finite() || x.abs() > 4.0 {
         return Vec2::X;
     }
     let (mut cosine, mut sine, mut term) = (0.0, 0.0, 1.0);
@@ -239,7 +248,13 @@ pub(super) struct Averager<'a> {
 
 impl<'a> Averager<'a> {
     /// For `faces` faces of one material, whose alpha factor is `factor`.
-    pub fn new(images: &'a Images, texture: &'a Texture, alpha: AlphaMode, factor: f32, faces: usize) -> Self {
+    pub fn new(
+        images: &'a Images,
+        texture: &'a Texture,
+        alpha: AlphaMode,
+        factor: f32,
+        faces: usize,
+    ) -> Self {
         let share = (SAMPLES_MAX / faces.max(1) as u64).max(16);
         let pattern_max = (share.isqrt() as u32).min(PATTERN_MAX);
         Self { texture, image: images.get(texture), alpha, factor, pattern_max, memory: HashMap::new() }
@@ -324,7 +339,8 @@ struct Sums {
 impl Sums {
     /// The colour is that of the covered part: what a leaf card hides must not colour the leaf.
     fn average(&self) -> Average {
-        let (sums, weight) = if self.cover > 0.0 { (self.covered, self.cover) } else { (self.plain, self.count) };
+        let (sums, weight) =
+            if self.cover > 0.0 { (self.covered, self.cover) } else { (self.plain, self.count) };
         Average { rgb: sums.map(|sum| sum / weight), opacity: self.cover / self.count }
     }
 }
@@ -378,7 +394,10 @@ mod tests {
                 assert!(wrap.texel(x, 8) < 8, "{wrap:?} {x}");
             }
         }
-        assert_eq!([Wrap::Repeat.texel(1.75, 8), Wrap::Mirror.texel(1.75, 8), Wrap::Clamp.texel(1.75, 8)], [6, 2, 7]);
+        assert_eq!(
+            [Wrap::Repeat.texel(1.75, 8), Wrap::Mirror.texel(1.75, 8), Wrap::Clamp.texel(1.75, 8)],
+            [6, 2, 7]
+        );
     }
 
     /// Catches a texture transform in the wrong order or turning the wrong way (v points down).
@@ -401,6 +420,8 @@ mod tests {
         image.write_to(&mut Cursor::new(&mut png), ImageFormat::Png).unwrap();
         assert!(decode_bytes(&png, 1 << 30).is_ok());
         assert!(decode_bytes(&png, 1 << 20).is_err());
-        assert!(decode_bytes(&png[..100], 1 << 30).is_err() && decode_bytes(b"RIFF....WEBP", 1 << 30).is_err());
+        assert!(
+            decode_bytes(&png[..100], 1 << 30).is_err() && decode_bytes(b"RIFF....WEBP", 1 << 30).is_err()
+        );
     }
 }

@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
+use crate::Result;
 use crate::import::ImportReport;
 use crate::import::emit::opacity_byte;
 use crate::import::lines::{self, LineReader};
 use crate::import::srgb;
-use crate::Result;
 
 /// Materials of a library at most.
 const MATERIALS_MAX: usize = 1 << 16;

@@ -14,14 +14,24 @@ use crate::{Error, ErrorKind, Result};
 
 /// Statements that describe curves and surfaces of higher order.
 const FREE_FORM: [&[u8]; 19] = [
-    b"vp", b"deg", b"bmat", b"step", b"cstype", b"curv", b"curv2", b"surf", b"parm", b"trim", b"hole", b"scrv",
-    b"sp", b"end", b"con", b"bzp", b"bsp", b"cdc", b"res",
+    b"vp", b"deg", b"bmat", b"step", b"cstype", b"curv", b"curv2", b"surf", b"parm", b"trim", b"hole",
+    b"scrv", b"sp", b"end", b"con", b"bzp", b"bsp", b"cdc", b"res",
 ];
 
 /// Statements that say nothing about shape or colour, or that are done without.
 const IGNORED: [&[u8]; 12] = [
-    b"vt", b"s", b"mg", b"usemap", b"maplib", b"bevel", b"c_interp", b"d_interp", b"lod", b"shadow_obj",
-    b"trace_obj", b"vw",
+    b"vt",
+    b"s",
+    b"mg",
+    b"usemap",
+    b"maplib",
+    b"bevel",
+    b"c_interp",
+    b"d_interp",
+    b"lod",
+    b"shadow_obj",
+    b"trace_obj",
+    b"vw",
 ];
 
 /// Albedo of materials that have none.
@@ -368,7 +378,11 @@ fn numbers<'a, const N: usize>(
         count += 1;
     }
     if count < 3 {
-        return Err(reader.error(ErrorKind::Invalid, keyword, format!("{count} numbers, at least 3 expected")));
+        return Err(reader.error(
+            ErrorKind::Invalid,
+            keyword,
+            format!("{count} numbers, at least 3 expected"),
+        ));
     }
     Ok((values, count))
 }

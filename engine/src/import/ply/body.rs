@@ -88,7 +88,11 @@ impl Body {
                 *at = *last + token.len();
                 lines::number(token).ok_or_else(|| {
                     let text = String::from_utf8_lossy(&token[..token.len().min(40)]).into_owned();
-                    reader.error(ErrorKind::Invalid, token, format!("`{}` is not a number", text.escape_default()))
+                    reader.error(
+                        ErrorKind::Invalid,
+                        token,
+                        format!("`{}` is not a number", text.escape_default()),
+                    )
                 })
             }
             Self::Binary { reader, big_endian, offset, path, .. } => {

@@ -157,7 +157,11 @@ fn parse(bytes: &[u8], path: &Path) -> Result<Header> {
     let mut lines = bytes[..blank].iter().filter(|&&b| b == b'\n').count() as u64;
     let mut rest = &bytes[blank..];
     if !rest.starts_with(b"ply") {
-        return Err(Error::corrupt(path, blank as u64, "this is not a PLY file: it does not begin with `ply`"));
+        return Err(Error::corrupt(
+            path,
+            blank as u64,
+            "this is not a PLY file: it does not begin with `ply`",
+        ));
     }
     let lone_return = rest[3..].starts_with(b"\r") && !rest[3..].starts_with(b"\r\n");
     let mut encoding = None;
@@ -212,7 +216,8 @@ fn statement(words: &[&str], encoding: &mut Option<Encoding>, elements: &mut Vec
             elements.push(Element { name: name.to_string(), count, properties: Vec::new() });
         }
         ["property", rest @ ..] => {
-            let element = elements.last_mut().ok_or_else(|| Error::invalid("a property before any element"))?;
+            let element =
+                elements.last_mut().ok_or_else(|| Error::invalid("a property before any element"))?;
             let property = property(rest)?;
             if element.properties.len() >= ENTRIES_MAX {
                 return Err(Error::invalid(format!("more than {ENTRIES_MAX} properties")));
@@ -236,7 +241,10 @@ fn property(words: &[&str]) -> Result<Property> {
         ["list", length, scalar, name, ..] => {
             let length = Scalar::named(length)?;
             if length.integer_max().is_none() {
-                return Err(Error::invalid(format!("list `{}` has a length that is not an integer", name.escape_default())));
+                return Err(Error::invalid(format!(
+                    "list `{}` has a length that is not an integer",
+                    name.escape_default()
+                )));
             }
             Ok(Property { name: name.to_string(), scalar: Scalar::named(scalar)?, length: Some(length) })
         }

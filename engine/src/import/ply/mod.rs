@@ -40,7 +40,8 @@ fn read(path: &Path, options: &ImportOptions, report: &mut ImportReport) -> Resu
     let header = header::read(&mut file, path)?;
     let mut body = Body::open(file, &header, path)?;
     body.check(&header.elements, header.encoding)?;
-    let count = |name: &str| header.elements.iter().find(|element| element.name == name).map_or(0, |e| e.count);
+    let count =
+        |name: &str| header.elements.iter().find(|element| element.name == name).map_or(0, |e| e.count);
     let (vertices, faces, edges) = (count("vertex"), count("face"), count("edge"));
     if faces == 0 && count("tristrips") > 0 {
         return Err(Error::unsupported("triangle strips in PLY are not supported yet")
@@ -52,7 +53,10 @@ fn read(path: &Path, options: &ImportOptions, report: &mut ImportReport) -> Resu
     let corners = if is_cloud { vertices } else { faces.saturating_mul(3) };
     budget.take(Mesh::bytes(vertices, corners, faces), "the mesh")?;
     if u32::try_from(vertices).is_err() {
-        return Err(Error::new(ErrorKind::Limit, format!("{vertices} vertices, at most 4,294,967,295 are possible")));
+        return Err(Error::new(
+            ErrorKind::Limit,
+            format!("{vertices} vertices, at most 4,294,967,295 are possible"),
+        ));
     }
     let mut mesh = Mesh::default();
     for element in &header.elements {
@@ -115,8 +119,9 @@ fn read_vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<
     let colors = (0..3).all(|channel| has(Role::Color(channel)));
     let opacities = has(Role::Alpha);
     let radii = has(Role::Radius) || has(Role::Diameter);
-    mesh.single_precision =
-        roles.iter().all(|(property, role)| !matches!(role, Role::Position(_)) || property.scalar == Scalar::F32);
+    mesh.single_precision = roles
+        .iter()
+        .all(|(property, role)| !matches!(role, Role::Position(_)) || property.scalar == Scalar::F32);
     for _ in 0..element.count {
         body.begin_row()?;
         let (mut position, mut normal, mut color) = (DVec3::ZERO, Vec3::ZERO, [0; 3]);
@@ -210,7 +215,12 @@ fn read_faces(
 }
 
 /// Adds a face of any number of corners.
-fn push_polygon(mesh: &mut Mesh, corners: &[u32], budget: &mut Budget, report: &mut ImportReport) -> Result<()> {
+fn push_polygon(
+    mesh: &mut Mesh,
+    corners: &[u32],
+    budget: &mut Budget,
+    report: &mut ImportReport,
+) -> Result<()> {
     match corners.len() {
         0..3 => report.skip("faces of fewer than three corners", 1),
         3 => mesh.push_face(FACE, corners, report)?,

@@ -216,8 +216,8 @@ pub fn fern(plan: &mut Plan, rng: &mut Rng, scale: f32) {
             length: 0.19 * scale,
             half_width: 0.0135 * scale,
             bend: 0.5,
-            fold: 0.25,
-            columns: 2,
+            fold: 0.0,
+            columns: 1,
             rows: 4,
         };
         let form = leaflets(&FERN, blade, 8, 0.3, 0.08);

@@ -29,7 +29,7 @@ use Species::*;
 
 const JUNGLE: &[Storey] = &[
     Storey {
-        spacing: 7.6,
+        spacing: 7.8,
         species: &[(Giant, 1.0)],
         chance: 0.85,
         in_clearing: 0.0,
@@ -40,7 +40,7 @@ const JUNGLE: &[Storey] = &[
     Storey {
         spacing: 3.5,
         species: &[(Sapling, 0.62), (Palm, 0.24), (TreeFern, 0.14)],
-        chance: 0.62,
+        chance: 0.56,
         in_clearing: 0.0,
         at_edge: 0.2,
         setback: 1.2,
@@ -48,7 +48,7 @@ const JUNGLE: &[Storey] = &[
     },
     Storey {
         spacing: 2.2,
-        species: &[(Banana, 0.26), (Shrub, 0.3), (ElephantEar, 0.18), (SplitLeaf, 0.2), (TreeFern, 0.06)],
+        species: &[(Banana, 0.29), (Shrub, 0.3), (ElephantEar, 0.18), (SplitLeaf, 0.2), (TreeFern, 0.03)],
         chance: 0.55,
         in_clearing: 0.0,
         at_edge: 0.5,
@@ -57,7 +57,7 @@ const JUNGLE: &[Storey] = &[
     },
     Storey {
         spacing: 1.1,
-        species: &[(Fern, 0.46), (Shrub, 0.1), (ElephantEar, 0.16), (SplitLeaf, 0.16), (Rosette, 0.12)],
+        species: &[(Fern, 0.46), (Shrub, 0.1), (ElephantEar, 0.16), (SplitLeaf, 0.12), (Rosette, 0.16)],
         chance: 0.46,
         in_clearing: 0.16,
         at_edge: 0.35,

@@ -40,7 +40,7 @@ fn hash(stream: &mut ProceduralStream, grids: usize) -> (u64, usize) {
 #[test]
 fn bytes_are_frozen() {
     let hashes = KINDS.map(|kind| hash(&mut stream(kind, 7, 1_000_000), 3000).0);
-    let frozen = [0x8f09_98a8_6679_d949, 0x0a22_9910_3b62_415b, 0x1f9d_b412_a389_17e4];
+    let frozen = [0x19dc_f69b_a02e_a6ad, 0x0a22_9910_3b62_415b, 0x1f9d_b412_a389_17e4];
     assert_eq!(hashes, frozen, "now {hashes:#018x?}");
 }
 
