@@ -105,11 +105,11 @@ pub fn describe(report: &Report) -> String {
     let bake = &report.bake;
     if !report.bake_sets.is_empty() {
         lines.push(format!(
-            "traced     {} rays for {} points in {}: {}rays/s on {} threads ({}, {})",
+            "traced     {} rays for {} points in {}: {} rays/s on {} threads ({}, {})",
             figures::short(bake.rays as f64),
             figures::count(bake.points),
             figures::seconds(bake.seconds),
-            with_unit(bake.rays_per_second),
+            figures::short(bake.rays_per_second),
             bake.threads,
             bake.device,
             bake.instructions,
@@ -141,9 +141,9 @@ fn describe_map(report: &Report) -> String {
     let how = match map.reused {
         true => "reused".into(),
         false => format!(
-            "built in {}, {}micropolygons/s",
+            "built in {}, {} micropolygons/s",
             figures::seconds(map.seconds),
-            with_unit(map.micropolygons_per_second)
+            figures::short(map.micropolygons_per_second)
         ),
     };
     format!(
@@ -168,12 +168,6 @@ fn describe_set(set: &BakeSetReport) -> String {
         figures::seconds(set.split_seconds),
         figures::seconds(set.merge_seconds),
     )
-}
-
-/// A rate's number, ready for its unit.
-fn with_unit(rate: f64) -> String {
-    let text = figures::short(rate);
-    if text.contains(' ') { text } else { format!("{text} ") }
 }
 
 /// What traces.
