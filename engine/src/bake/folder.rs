@@ -41,9 +41,11 @@ impl Folder {
             .map_err(|e| Error::io("open", &lock_path, e))?;
         match lock.try_lock() {
             Ok(()) => Ok(Self { path: path.to_path_buf(), _lock: lock }),
-            Err(std::fs::TryLockError::WouldBlock) => Err(Error::new(ErrorKind::Busy, "another bake is using this folder")
-                .at(path)
-                .hint("wait for it, or give another folder")),
+            Err(std::fs::TryLockError::WouldBlock) => {
+                Err(Error::new(ErrorKind::Busy, "another bake is using this folder")
+                    .at(path)
+                    .hint("wait for it, or give another folder"))
+            }
             Err(std::fs::TryLockError::Error(error)) => Err(Error::io("lock", &lock_path, error)),
         }
     }
@@ -75,9 +77,11 @@ impl Folder {
         match known {
             Some(known) if known == record && !restart => return Ok(()),
             Some(known) if known != record && !restart => {
-                return Err(Error::invalid("this folder holds an unfinished bake of another scene, input or option")
-                    .at(&self.path)
-                    .hint("give another folder, or `--restart` to begin anew here"));
+                return Err(Error::invalid(
+                    "this folder holds an unfinished bake of another scene, input or option",
+                )
+                .at(&self.path)
+                .hint("give another folder, or `--restart` to begin anew here"));
             }
             _ => {}
         }
@@ -102,7 +106,9 @@ impl Folder {
         }
         let record = self.path.join("work").join("bake.json");
         match std::fs::remove_file(&record) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(Error::io("remove", &record, error)),
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                Err(Error::io("remove", &record, error))
+            }
             _ => Ok(()),
         }
     }

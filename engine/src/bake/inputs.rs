@@ -97,7 +97,9 @@ impl Inputs {
                 (_, Some(file)) => {
                     Box::new(Convert::to_units(MgsReader::open(file)?, scene.meters_per_unit, scene.up)?)
                 }
-                (StreamSource::File(path), None) => return Err(Error::invalid("the file was not imported").at(path)),
+                (StreamSource::File(path), None) => {
+                    return Err(Error::invalid("the file was not imported").at(path));
+                }
             });
         }
         let stream = match opened.len() {

@@ -123,8 +123,11 @@ struct Occluders {
 pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Control<'_>) -> Result<Report> {
     let start = Instant::now();
     if options.memory_bytes < MEMORY_BYTES_MIN {
-        return Err(Error::new(ErrorKind::Limit, format!("{} bytes of memory are too few", options.memory_bytes))
-            .hint("at least 256MiB are needed"));
+        return Err(Error::new(
+            ErrorKind::Limit,
+            format!("{} bytes of memory are too few", options.memory_bytes),
+        )
+        .hint("at least 256MiB are needed"));
     }
     if scene.geometries.iter().all(|geometry| geometry.bake_sets.is_empty()) {
         return Err(Error::invalid("the scene has no bake set")
@@ -135,8 +138,12 @@ pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Contro
     let mut report = Report::default();
 
     // Import, and see whether this is the bake that the folder knows
-    let inputs =
-        Inputs::prepare(scene, &folder.work("import")?, options.memory_bytes / 2, &mut control.stage("import"))?;
+    let inputs = Inputs::prepare(
+        scene,
+        &folder.work("import")?,
+        options.memory_bytes / 2,
+        &mut control.stage("import"),
+    )?;
     for (path, import) in &inputs.reports {
         report.skipped.extend(import.skipped.iter().cloned());
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -155,7 +162,15 @@ pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Contro
                 maps.push(open_map(scene, &inputs, seen.clone(), options, &folder, &mut report, control)?);
             }
             let occluders = maps.iter().find(|map| map.geometries == seen).expect("just made");
-            let set = BakeSetJob { scene, inputs: &inputs, geometry: number, bake_set, occluders, options, identity };
+            let set = BakeSetJob {
+                scene,
+                inputs: &inputs,
+                geometry: number,
+                bake_set,
+                occluders,
+                options,
+                identity,
+            };
             report.bake_sets.push(set.run(&folder, &mut work, control)?);
         }
     }
@@ -175,12 +190,21 @@ pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Contro
 ///
 /// # Errors
 /// As [`bake`].
-pub fn build_map(scene: &Scene, options: &BakeOptions, target: &Path, control: Control<'_>) -> Result<Report> {
+pub fn build_map(
+    scene: &Scene,
+    options: &BakeOptions,
+    target: &Path,
+    control: Control<'_>,
+) -> Result<Report> {
     let start = Instant::now();
     let folder = Folder::open(target)?;
     let mut report = Report::default();
-    let inputs =
-        Inputs::prepare(scene, &folder.work("import")?, options.memory_bytes / 2, &mut control.stage("import"))?;
+    let inputs = Inputs::prepare(
+        scene,
+        &folder.work("import")?,
+        options.memory_bytes / 2,
+        &mut control.stage("import"),
+    )?;
     let all = (0..scene.geometries.len()).filter(|&g| scene.geometries[g].occluder).collect();
     open_map(scene, &inputs, all, options, &folder, &mut report, control)?;
     folder.finish()?;
@@ -206,7 +230,9 @@ fn identity(scene: &Scene, inputs: &Inputs, options: &BakeOptions) -> u64 {
         hash.update(format!("{} {} {:?}\n", geometry.name, geometry.occluder, geometry.bake_sets).as_bytes());
     }
     let BakeOptions { lod, far_field, seed, samples, points_max, .. } = options;
-    hash.update(format!("{:?}\n{lod:?} {far_field:?} {seed} {samples:?} {points_max:?}", scene.shaders).as_bytes());
+    hash.update(
+        format!("{:?}\n{lod:?} {far_field:?} {seed} {samples:?} {points_max:?}", scene.shaders).as_bytes(),
+    );
     hash.digest()
 }
 
@@ -291,10 +317,12 @@ impl BakeSetJob<'_> {
 
         // Trace those that are not done
         let attributes = self.attributes(&shaders);
-        let bake = xxh3_64(format!("{:016x} {} {:016x}", self.identity, self.bake_set.name, plan.hash()).as_bytes());
+        let bake =
+            xxh3_64(format!("{:016x} {} {:016x}", self.identity, self.bake_set.name, plan.hash()).as_bytes());
         let format = PartFormat::new(bake, &attributes, plan.points_per_batch_max())?;
         let mut log = PartLog::open(scratch.join("parts"), &format, plan.len() as u32)?;
-        let todo: Vec<u32> = batches.iter().copied().filter(|&b| !log.completed().contains(u64::from(b))).collect();
+        let todo: Vec<u32> =
+            batches.iter().copied().filter(|&b| !log.completed().contains(u64::from(b))).collect();
         report.batches_continued = (batches.len() - todo.len()) as u64;
         report.batches = todo.len() as u64;
         self.trace(&plan, &shaders, &format, &todo, &mut log, work, control)?;
@@ -329,7 +357,8 @@ impl BakeSetJob<'_> {
                 }
             }
         };
-        let unknown = |name: &str| Error::invalid(format!("no shader is called `{name}`")).at(&self.scene.path);
+        let unknown =
+            |name: &str| Error::invalid(format!("no shader is called `{name}`")).at(&self.scene.path);
         let attributes = self.bake_set.attributes.iter();
         attributes.map(|a| shading(&a.shader).ok_or_else(|| unknown(&a.shader))).collect()
     }
@@ -338,13 +367,18 @@ impl BakeSetJob<'_> {
     fn attributes(&self, shaders: &[Shading]) -> Vec<Attribute> {
         let pairs = self.bake_set.attributes.iter().zip(shaders);
         pairs
-            .map(|(a, shading)| Attribute::vertex(&a.name, shading.shader.storage, shading.coefficients() as u16))
+            .map(|(a, shading)| {
+                Attribute::vertex(&a.name, shading.shader.storage, shading.coefficients() as u16)
+            })
             .collect()
     }
 
     /// What the output says about its spherical harmonics.
     fn metadata(&self, shaders: &[Shading]) -> Vec<(String, String)> {
-        let mut metadata = vec![("sh.convention".into(), "real orthonormal, index l(l+1)+m, no Condon-Shortley phase".into())];
+        let mut metadata = vec![(
+            "sh.convention".into(),
+            "real orthonormal, index l(l+1)+m, no Condon-Shortley phase".into(),
+        )];
         for (attribute, Shading { shader, .. }) in self.bake_set.attributes.iter().zip(shaders) {
             let of = |what: &str| format!("{}.{what}", attribute.name);
             metadata.push((of("shader"), "sh_occlusion".into()));
@@ -378,7 +412,10 @@ impl BakeSetJob<'_> {
     }
 
     /// Traces the batches `todo` and appends their parts to the log.
-    #[expect(clippy::too_many_arguments, reason = "the parts of one loop; a struct for them would have no meaning")]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the parts of one loop; a struct for them would have no meaning"
+    )]
     fn trace(
         &self,
         plan: &BatchPlan,
@@ -421,7 +458,11 @@ impl BakeSetJob<'_> {
             work.batches += 1;
             work.seconds += start.elapsed().as_secs_f64();
             let rate = work.rays as f64 / work.seconds.max(1e-9) / 1e6;
-            control.progress.update("trace", (done + 1) as f64 / todo.len() as f64, &format!("{rate:.1} M rays/s"));
+            control.progress.update(
+                "trace",
+                (done + 1) as f64 / todo.len() as f64,
+                &format!("{rate:.1} M rays/s"),
+            );
             control.check()?;
         }
         work.add_arena(&tracer);

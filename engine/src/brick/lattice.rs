@@ -13,7 +13,7 @@ use crate::{Error, ErrorKind, Result};
 pub const COORDINATE_MAX: i32 = 1 << 29;
 
 /// An edge is at least `2^EDGE_BITS` steps long: rounding moves a vertex by at most 1/256 of an edge, which keeps
-/// the bumps that rounding gives to an oblique plane below 0.2 degrees.
+/// the bumps that rounding gives to an oblique plane below a quarter of a degree.
 pub const EDGE_BITS: i32 = 7;
 
 /// Largest shift of a geometry.

@@ -5,17 +5,19 @@
 //!      1  vertices     u8       1 to 32
 //!      2  bits         3 x u8   bits of a vertex coordinate, per axis, 0 to 30
 //!      5  shift        u8       coordinates are origin + (packed << shift)
-//!      6  flags        u8       1: indices are bytes, not nibbles; 2: extinctions follow; 4: round faces
-//!      7  short        u8       bit i: face i is a triangle (flat leaves) or a point (round leaves)
+//!      6  flags        u8       1: indices of 5 bits, not 4; 2: extinctions follow; 4: round faces; 8: tile
+//!      7  short        u8       bit i: face i is a triangle (flat leaves) or a point (round leaves);
+//!                               in a tile, quads across
 //!      8  origin       3 x i32  lattice coordinates of the vertices' lower corner
-//!     20  indices      4 per face (2 in round leaves), nibbles or bytes
+//!     20  indices      first corners of 8 faces, then second ones, up to fourth (second in round leaves), each
+//!                      corner's 8 indices in 4 or 5 bytes; none in a tile
 //!         coordinates  per axis ceil(vertices * bits / 8) bytes, least significant bit first
 //!         extinctions  u16 per face, if flagged
 //!         radii        f32 per vertex in lattice steps, round leaves only
 //! ```
 //!
 //! Flat leaves hold triangles and quads, round leaves points (spheres) and lines (round cones). A triangle repeats
-//! its last index, a point its only one.
+//! its last index, a point its only one. A tile is a piece of a regular grid, faces and vertices in rows.
 
 use glam::IVec3;
 
@@ -32,9 +34,10 @@ pub const HEADER_BYTES: usize = 20;
 /// Readable bytes a decoder may touch past a leaf's end.
 pub const READ_PAST_BYTES: usize = 64;
 
-const FLAG_BYTE_INDICES: u8 = 1;
+const FLAG_LONG_INDICES: u8 = 1;
 const FLAG_EXTINCTIONS: u8 = 2;
 const FLAG_ROUND: u8 = 4;
+const FLAG_TILE: u8 = 8;
 
 /// Extinction of a fully opaque face.
 pub const OPAQUE: u16 = u16::MAX;
@@ -94,12 +97,14 @@ pub struct Layout {
     pub bits: [u8; 3],
     /// Left shift of packed coordinates.
     pub shift: u8,
-    /// Whether indices take a byte each.
-    pub byte_indices: bool,
+    /// Bits of an index, which are the bytes of a corner's 8 indices: 4 or 5.
+    pub index_bits: usize,
     /// Whether every face is opaque.
     pub opaque: bool,
     /// Whether faces are points and lines.
     pub round: bool,
+    /// Quads across a tile; 0 if it is none.
+    pub columns: usize,
     /// Bit i: face i is a triangle, or a point.
     pub short: u8,
     /// Lower corner of the vertices.
@@ -126,7 +131,7 @@ impl Layout {
             && (1..=VERTICES_MAX).contains(&layout.vertices)
             && layout.bits.iter().all(|&bits| bits <= BITS_MAX)
             && u32::from(layout.shift) <= 29
-            && leaf[6] <= 7
+            && (leaf[6] <= 7 || leaf[6] & !FLAG_EXTINCTIONS == FLAG_TILE && layout.is_whole_tile())
             && layout.bytes <= leaf.len();
         sane.then_some(layout)
     }
@@ -137,9 +142,16 @@ impl Layout {
         let word = |at: usize| i32::from_le_bytes(leaf[at..at + 4].try_into().expect("4 bytes"));
         let (faces, vertices, flags) = (usize::from(leaf[0]), usize::from(leaf[1]), leaf[6]);
         let bits = [leaf[2], leaf[3], leaf[4]];
-        let (byte_indices, round) = (flags & FLAG_BYTE_INDICES != 0, flags & FLAG_ROUND != 0);
-        let index_count = faces * if round { 2 } else { 4 };
-        let mut at = HEADER_BYTES + if byte_indices { index_count } else { index_count / 2 };
+        let (index_bits, round) = (4 + usize::from(flags & FLAG_LONG_INDICES != 0), flags & FLAG_ROUND != 0);
+        let is_tile = flags & FLAG_TILE != 0;
+        let corners = if is_tile {
+            0
+        } else if round {
+            2
+        } else {
+            4
+        };
+        let mut at = HEADER_BYTES + corners * index_bits;
         let coordinates = bits.map(|bits| {
             let here = at;
             at += (vertices * usize::from(bits)).div_ceil(8);
@@ -155,10 +167,11 @@ impl Layout {
             vertices,
             bits,
             shift: leaf[5],
-            byte_indices,
+            index_bits,
             opaque,
             round,
-            short: leaf[7],
+            columns: if is_tile { usize::from(leaf[7]) } else { 0 },
+            short: if is_tile { 0 } else { leaf[7] },
             origin: IVec3::new(word(8), word(12), word(16)),
             coordinates,
             extinctions,
@@ -167,15 +180,23 @@ impl Layout {
         }
     }
 
+    /// Whether a tile's faces and vertices are rows of its columns.
+    fn is_whole_tile(&self) -> bool {
+        (1..=FACES_MAX).contains(&self.columns)
+            && self.faces % self.columns == 0
+            && self.vertices == (self.columns + 1) * (self.faces / self.columns + 1)
+    }
+
     /// The vertex index of corner `corner` of face `face`.
     #[inline(always)]
     pub fn index(&self, leaf: &[u8], face: usize, corner: usize) -> usize {
-        let at = face * if self.round { 2 } else { 4 } + corner;
-        usize::from(if self.byte_indices {
-            leaf[HEADER_BYTES + at]
-        } else {
-            leaf[HEADER_BYTES + at / 2] >> (4 * (at & 1)) & 15
-        })
+        if self.columns > 0 {
+            let wide = self.columns + 1;
+            return face + face / self.columns + [0, 1, wide + 1, wide][corner];
+        }
+        let at = HEADER_BYTES + corner * self.index_bits;
+        let word = u64::from_le_bytes(leaf[at..at + 8].try_into().expect("8 bytes"));
+        (word >> (face * self.index_bits)) as usize & ((1 << self.index_bits) - 1)
     }
 
     /// The extinction of a face.
@@ -264,47 +285,28 @@ pub fn encode(faces: &[Face], shift: u8, out: &mut Vec<u8>) {
         }
     }
 
-    // Find the widths
-    let positions = || vertices[..count].iter().map(|v| v.0);
-    let origin = positions().fold(IVec3::MAX, IVec3::min);
-    let extent = (positions().fold(IVec3::MIN, IVec3::max) - origin) >> i32::from(shift);
-    let bits = extent.to_array().map(|extent| (32 - extent.leading_zeros()) as u8);
-    debug_assert!(bits.iter().all(|&bits| bits <= BITS_MAX));
-
     // Write the fixed part and the indices
-    let start = out.len();
-    let byte_indices = count > 16;
     let opaque = faces.iter().all(|face| face.extinction == OPAQUE);
-    let flags = u8::from(byte_indices) * FLAG_BYTE_INDICES
+    let long_indices = count > 16;
+    let flags = u8::from(long_indices) * FLAG_LONG_INDICES
         | u8::from(!opaque) * FLAG_EXTINCTIONS
         | u8::from(round) * FLAG_ROUND;
     let short_arity = corners as u8 - 1;
     let short = faces.iter().enumerate().fold(0, |mask, (i, f)| mask | u8::from(f.arity == short_arity) << i);
-    out.extend_from_slice(&[faces.len() as u8, count as u8, bits[0], bits[1], bits[2], shift, flags, short]);
-    origin.to_array().iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
-    let indices = &indices[..faces.len() * corners];
-    if byte_indices {
-        out.extend_from_slice(indices);
-    } else {
-        out.extend(indices.chunks_exact(2).map(|pair| pair[0] | pair[1] << 4));
+    let start = out.len();
+    let positions = vertices.map(|vertex| vertex.0);
+    let pack = Packing::of(&positions[..count], shift);
+    pack.write_header(faces.len(), flags, short, out);
+    let index_bits = 4 + usize::from(long_indices);
+    for corner in 0..corners {
+        let word = (0..faces.len()).fold(0_u64, |word, face| {
+            word | u64::from(indices[face * corners + corner]) << (face * index_bits)
+        });
+        out.extend_from_slice(&word.to_le_bytes()[..index_bits]);
     }
 
-    // Pack the coordinates
-    for axis in 0..3 {
-        let (mut word, mut filled) = (0_u64, 0);
-        for position in positions() {
-            word |= (((position[axis] - origin[axis]) >> shift) as u64) << filled;
-            filled += u32::from(bits[axis]);
-            while filled >= 8 {
-                out.push(word as u8);
-                word >>= 8;
-                filled -= 8;
-            }
-        }
-        if filled > 0 {
-            out.push(word as u8);
-        }
-    }
+    // Then the columns
+    pack.write_coordinates(out);
     if !opaque {
         faces.iter().for_each(|face| out.extend_from_slice(&face.extinction.to_le_bytes()));
     }
@@ -312,6 +314,61 @@ pub fn encode(faces: &[Face], shift: u8, out: &mut Vec<u8>) {
         vertices[..count].iter().for_each(|v| out.extend_from_slice(&v.1.to_le_bytes()));
     }
     out.resize(start + (out.len() - start).next_multiple_of(8), 0);
+}
+
+/// Appends a tile: `columns` quads across, their vertices in rows, their extinctions likewise. See [`encode`].
+pub fn encode_tile(vertices: &[IVec3], columns: usize, extinctions: &[u16], shift: u8, out: &mut Vec<u8>) {
+    debug_assert!((1..=FACES_MAX).contains(&extinctions.len()) && vertices.len() <= VERTICES_MAX);
+    let opaque = extinctions.iter().all(|&extinction| extinction == OPAQUE);
+    let flags = FLAG_TILE | u8::from(!opaque) * FLAG_EXTINCTIONS;
+    let start = out.len();
+    let pack = Packing::of(vertices, shift);
+    pack.write_header(extinctions.len(), flags, columns as u8, out);
+    pack.write_coordinates(out);
+    if !opaque {
+        extinctions.iter().for_each(|extinction| out.extend_from_slice(&extinction.to_le_bytes()));
+    }
+    out.resize(start + (out.len() - start).next_multiple_of(8), 0);
+}
+
+/// Vertices and how many bits their coordinates take.
+struct Packing<'a> {
+    vertices: &'a [IVec3],
+    shift: u8,
+    origin: IVec3,
+    bits: [u8; 3],
+}
+
+impl<'a> Packing<'a> {
+    fn of(vertices: &'a [IVec3], shift: u8) -> Self {
+        let origin = vertices.iter().fold(IVec3::MAX, |low, &v| low.min(v));
+        let high = vertices.iter().fold(IVec3::MIN, |high, &v| high.max(v));
+        let bits = ((high - origin) >> i32::from(shift)).to_array().map(|e| (32 - e.leading_zeros()) as u8);
+        debug_assert!(bits.iter().all(|&bits| bits <= BITS_MAX));
+        Self { vertices, shift, origin, bits }
+    }
+
+    fn write_header(&self, faces: usize, flags: u8, short: u8, out: &mut Vec<u8>) {
+        let [x, y, z] = self.bits;
+        out.extend_from_slice(&[faces as u8, self.vertices.len() as u8, x, y, z, self.shift, flags, short]);
+        self.origin.to_array().iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
+    }
+
+    fn write_coordinates(&self, out: &mut Vec<u8>) {
+        for axis in 0..3 {
+            let (mut word, mut filled) = (0_u64, 0);
+            for position in self.vertices {
+                word |= (((position[axis] - self.origin[axis]) >> self.shift) as u64) << filled;
+                filled += u32::from(self.bits[axis]);
+                if filled >= 32 {
+                    out.extend_from_slice(&(word as u32).to_le_bytes());
+                    word >>= 32;
+                    filled -= 32;
+                }
+            }
+            out.extend_from_slice(&word.to_le_bytes()[..filled.div_ceil(8) as usize]);
+        }
+    }
 }
 
 #[cfg(test)]
@@ -357,6 +414,34 @@ mod tests {
             assert_eq!(layout.bytes + READ_PAST_BYTES, bytes.len());
             let decoded: Vec<Face> = (0..count).map(|i| layout.face(&bytes, i)).collect();
             assert_eq!(decoded, faces, "case {case}");
+        }
+    }
+
+    /// Catches a tile that decodes to other faces than the same faces with indices.
+    #[test]
+    fn tiles_equal_their_faces() {
+        for (columns, rows) in [(4, 2), (2, 4), (8, 1), (1, 8), (3, 2), (1, 1)] {
+            let wide = columns + 1;
+            let vertices: Vec<IVec3> =
+                (0..wide * (rows + 1)).map(|i| IVec3::new(i % wide, i / wide, i * i % 7) * 40).collect();
+            let at = |i: i32| vertices[i as usize];
+            let faces: Vec<Face> = (0..columns * rows)
+                .map(|face| face + face / columns)
+                .map(|a| Face {
+                    vertices: [at(a), at(a + 1), at(a + wide + 1), at(a + wide)],
+                    arity: 4,
+                    extinction: 1000 + a as u16,
+                    radii: [0.0; 2],
+                })
+                .collect();
+            let extinctions: Vec<u16> = faces.iter().map(|face| face.extinction).collect();
+            let mut bytes = Vec::new();
+            encode_tile(&vertices, columns as usize, &extinctions, 3, &mut bytes);
+            let length = bytes.len();
+            bytes.resize(length + READ_PAST_BYTES, 0);
+            let layout = Layout::read(&bytes[..length]).unwrap();
+            assert!(layout.is_sound(&bytes));
+            assert_eq!((0..faces.len()).map(|i| layout.face(&bytes, i)).collect::<Vec<_>>(), faces);
         }
     }
 

@@ -1,7 +1,7 @@
 //! Bricks: what the builder writes and the tracers read (paper, section 4.1).
 //!
 //! A brick is a treelet of at most 256 nodes with all its leaves, contiguous in memory and on disk. Inside it, all
-//! references are 8 to 14 bits; a child may be another brick. [`lattice`] has the integer coordinates, [`node`] and
+//! references are 14 bits; a child may be another brick. [`lattice`] has the integer coordinates, [`node`] and
 //! [`leaf`] the two records, [`intersect`] rays against faces, [`bundle`] the rays of a few points, [`lanes`] the inner
 //! loops per instruction set, [`walk`] any hit over bricks.
 //!
@@ -14,7 +14,7 @@
 //!      24  nodes          u16      1 to 256, the root first, children after their parents
 //!      26  children       u16      entries of the table of brick numbers, 0 to 256
 //!      28  reserved       36 bytes of zero
-//!      64  nodes, 128 bytes each; then the table of brick numbers, u32 each; then, from a multiple of 8, the leaves
+//!      64  nodes, 128 bytes each; then the table of brick numbers, u64 each; then the leaves
 //! ```
 
 pub mod bundle;
@@ -87,7 +87,7 @@ impl<'a> Brick<'a> {
             return corrupt("checksum does not match");
         }
         let (nodes, children) = (brick.node_count(), brick.child_count());
-        let leaves = leaves_offset(nodes, children);
+        let (table, leaves) = (table_offset(nodes), leaves_offset(nodes, children));
         if !(1..=NODES_MAX).contains(&nodes) || children > CHILDREN_MAX || leaves > length {
             return corrupt("impossible counts");
         }
@@ -101,16 +101,24 @@ impl<'a> Brick<'a> {
             if usize::from(node.count) > node::WIDTH || node.exponent.iter().any(|&e| e > 23) {
                 return corrupt("impossible node");
             }
+            let from = table_offset(index);
             for slot in 0..usize::from(node.count) {
                 let sound = match node.child(slot) {
                     // Children come after their parents and have one only: no cycles, no blow-up
-                    Some(Child::Node(child)) => {
-                        let child = usize::from(child);
-                        child > index && child < nodes && !std::mem::replace(&mut has_parent[child], true)
+                    Some(Child::Node(offset)) => {
+                        let distance = 8 * usize::from(offset);
+                        let child = index + distance / size_of::<Node>();
+                        distance % size_of::<Node>() == 0
+                            && child > index
+                            && child < nodes
+                            && !std::mem::replace(&mut has_parent[child], true)
                     }
-                    Some(Child::Brick(child)) => usize::from(child) < children,
+                    Some(Child::Brick(offset)) => {
+                        let at = from + 8 * usize::from(offset);
+                        at >= table && at < table + 8 * children
+                    }
                     Some(Child::Leaf(offset)) => {
-                        let at = 8 * usize::from(offset);
+                        let at = from + 8 * usize::from(offset);
                         at >= leaves
                             && at < length
                             && leaf::Layout::read(&bytes[at..length])
@@ -151,13 +159,22 @@ impl<'a> Brick<'a> {
     /// The number of a child brick, by index in the table.
     #[inline(always)]
     pub fn child_brick(&self, index: usize) -> u32 {
-        self.u32_at(HEADER_BYTES + self.node_count() * size_of::<Node>() + 4 * index)
+        self.u32_at(table_offset(self.node_count()) + 8 * index)
     }
 
-    /// The bytes from a leaf on, by its offset in units of 8 bytes.
-    #[inline(always)]
-    pub fn leaf(&self, offset: u16) -> &'a [u8] {
-        &self.bytes[8 * usize::from(offset)..]
+    /// The bytes from what a node refers to on.
+    pub fn at(&self, node: usize, offset: u16) -> &'a [u8] {
+        &self.bytes[HEADER_BYTES + node * size_of::<Node>() + 8 * usize::from(offset)..]
+    }
+
+    /// The number of the child brick that a node refers to.
+    pub fn child_brick_at(&self, node: usize, offset: u16) -> u32 {
+        u32::from_le_bytes(self.at(node, offset)[..4].try_into().expect("4 bytes"))
+    }
+
+    /// The index of the node that a node refers to.
+    pub fn child_node(&self, node: usize, offset: u16) -> usize {
+        node + 8 * usize::from(offset) / size_of::<Node>()
     }
 
     fn u32_at(&self, at: usize) -> u32 {
@@ -165,9 +182,14 @@ impl<'a> Brick<'a> {
     }
 }
 
+/// Where the table of brick numbers starts.
+fn table_offset(nodes: usize) -> usize {
+    HEADER_BYTES + nodes * size_of::<Node>()
+}
+
 /// Where the leaves of a brick start.
 fn leaves_offset(nodes: usize, children: usize) -> usize {
-    (HEADER_BYTES + nodes * size_of::<Node>() + 4 * children).next_multiple_of(8)
+    table_offset(nodes) + 8 * children
 }
 
 /// Bytes of a brick of the given parts.
@@ -175,8 +197,8 @@ pub fn brick_bytes(nodes: usize, children: usize, leaf_bytes: usize) -> usize {
     (leaves_offset(nodes, children) + leaf_bytes).next_multiple_of(ALIGNMENT)
 }
 
-/// Appends a brick to `out`. Leaf children of `nodes` are given as offsets into `leaves` (in units of 8 bytes) and
-/// shifted to where the leaves come to lie.
+/// Appends a brick to `out`. Children of `nodes` are given by index: nodes in `nodes`, bricks in `children`, leaves by
+/// their offset in `leaves` in units of 8 bytes; here they get the places where things come to lie.
 ///
 /// # Panics
 /// When counts or bytes exceed [`NODES_MAX`], [`CHILDREN_MAX`] or [`BYTES_MAX`]: a builder's mistake.
@@ -190,19 +212,23 @@ pub fn assemble(
 ) {
     let length = brick_bytes(nodes.len(), children.len(), leaves.len());
     assert!(nodes.len() <= NODES_MAX && children.len() <= CHILDREN_MAX && length <= BYTES_MAX);
-    let first_leaf = leaves_offset(nodes.len(), children.len()) / 8;
-    for node in nodes.iter_mut() {
+    let (table, first_leaf) = (table_offset(nodes.len()), leaves_offset(nodes.len(), children.len()));
+    for (index, node) in nodes.iter_mut().enumerate() {
+        let from = table_offset(index);
+        let distance = |at: usize| ((at - from) / 8) as u16;
         for slot in 0..usize::from(node.count) {
-            if let Some(Child::Leaf(offset)) = node.child(slot) {
-                node.children[slot] = Child::Leaf(offset + first_leaf as u16).encode();
+            node.children[slot] = match node.child(slot).expect("a builder makes known children") {
+                Child::Node(child) => Child::Node(distance(table_offset(usize::from(child)))),
+                Child::Brick(child) => Child::Brick(distance(table + 8 * usize::from(child))),
+                Child::Leaf(offset) => Child::Leaf(distance(first_leaf + 8 * usize::from(offset))),
             }
+            .encode();
         }
     }
     let start = out.len();
     out.resize(start + HEADER_BYTES, 0);
     out.extend_from_slice(bytemuck::cast_slice(nodes));
-    children.iter().for_each(|child| out.extend_from_slice(&child.to_le_bytes()));
-    out.resize(start + 8 * first_leaf, 0);
+    children.iter().for_each(|&child| out.extend_from_slice(&u64::from(child).to_le_bytes()));
     out.extend_from_slice(leaves);
     out.resize(start + length, 0);
 
@@ -220,12 +246,12 @@ pub fn assemble(
 /// Gives a brick that [`assemble`] made, and its references to other bricks, numbers that are higher by `base`.
 pub fn renumber(brick: &mut [u8], base: u32) {
     let view = Brick::trusted(brick);
-    let table = HEADER_BYTES + view.node_count() * size_of::<Node>();
+    let table = table_offset(view.node_count());
     let (number, children) = (view.u32_at(16), view.child_count());
     brick[16..20].copy_from_slice(&(number + base).to_le_bytes());
-    for child in brick[table..table + 4 * children].chunks_exact_mut(4) {
+    for child in brick[table..table + 8 * children].chunks_exact_mut(8) {
         let number = u32::from_le_bytes([child[0], child[1], child[2], child[3]]);
-        child.copy_from_slice(&(number + base).to_le_bytes());
+        child[..4].copy_from_slice(&(number + base).to_le_bytes());
     }
     let checksum = xxh3_64(&brick[16..]);
     brick[8..16].copy_from_slice(&checksum.to_le_bytes());
@@ -234,7 +260,6 @@ pub fn renumber(brick: &mut [u8], base: u32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use bytemuck::Zeroable;
     use glam::IVec3;
 
     fn small_brick() -> (Vec<u8>, usize) {
@@ -288,15 +313,19 @@ mod tests {
     /// Catches references out of bounds that a valid checksum hides: a hostile file, not a damaged one.
     #[test]
     fn hostile_references_are_found() {
-        for child in [Child::Node(0), Child::Node(1), Child::Brick(1), Child::Leaf(2000)] {
-            let mut node = Node::zeroed();
-            node.count = 1;
-            node.children[0] = child.encode();
-            let mut bytes = Vec::new();
-            assemble(1, &mut [node], &[0], &[], 0, &mut bytes);
-            let length = bytes.len();
-            bytes.resize(length + leaf::READ_PAST_BYTES, 0);
-            assert!(Brick::check(&bytes, length, 1).is_err(), "{child:?}");
+        for child in [
+            Child::Node(0),
+            Child::Node(1),
+            Child::Node(16),
+            Child::Brick(0),
+            Child::Leaf(0),
+            Child::Leaf(2000),
+        ] {
+            let (mut bytes, length) = small_brick();
+            bytes[HEADER_BYTES + 16..HEADER_BYTES + 18].copy_from_slice(&child.encode().to_le_bytes());
+            let checksum = xxh3_64(&bytes[16..length]);
+            bytes[8..16].copy_from_slice(&checksum.to_le_bytes());
+            assert!(Brick::check(&bytes, length, 6).is_err(), "{child:?}");
         }
     }
 }

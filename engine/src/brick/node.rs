@@ -4,7 +4,8 @@
 //! byte   0  origin      3 x i32   lattice coordinates of the lower corner
 //!       12  exponent    3 x u8    a box unit is 2^exponent lattice steps, per axis
 //!       15  count       u8        children, 0 to 8
-//!       16  children    8 x u16   kind in the top 2 bits, location in the lower 14
+//!       16  children    8 x u16   kind in the top 2 bits, location in the lower 14: 8-byte units from
+//!                                 the node's start
 //!       32  lower       3 x 8 u8  lower faces of the children's boxes, x of all, y of all, z of all
 //!       56  upper       3 x 8 u8  upper faces
 //!       80  far         8 x 6 u8  far field of each child
@@ -22,15 +23,16 @@ pub const WIDTH: usize = 8;
 /// Bytes of a child's far field.
 pub const FAR_BYTES: usize = 6;
 
-/// What a child is, and where.
+/// What a child is, and where: in units of 8 bytes from the start of the node that refers to it, so that a walk needs
+/// nothing of a brick but the node it stands at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Child {
-    /// A node of the same brick, by index.
-    Node(u8),
-    /// A leaf of the same brick, by offset from the brick's start in units of 8 bytes.
+    /// A node of the same brick.
+    Node(u16),
+    /// A leaf of the same brick.
     Leaf(u16),
-    /// Another brick, by index in this brick's table of brick numbers.
-    Brick(u8),
+    /// Another brick: where its number stands in this brick's table.
+    Brick(u16),
 }
 
 const KIND_NODE: u16 = 0;
@@ -42,14 +44,13 @@ pub const LOCATION_BITS: u32 = 14;
 impl Child {
     /// The 16 bits stored in a node.
     pub fn encode(self) -> u16 {
-        match self {
-            Self::Node(index) => KIND_NODE << LOCATION_BITS | u16::from(index),
-            Self::Leaf(offset) => {
-                debug_assert!(offset < 1 << LOCATION_BITS);
-                KIND_LEAF << LOCATION_BITS | offset
-            }
-            Self::Brick(index) => KIND_BRICK << LOCATION_BITS | u16::from(index),
-        }
+        let (kind, location) = match self {
+            Self::Node(location) => (KIND_NODE, location),
+            Self::Leaf(location) => (KIND_LEAF, location),
+            Self::Brick(location) => (KIND_BRICK, location),
+        };
+        debug_assert!(location < 1 << LOCATION_BITS);
+        kind << LOCATION_BITS | location
     }
 
     /// What the 16 bits say; none for a kind that this version does not know.
@@ -57,9 +58,9 @@ impl Child {
     pub fn decode(bits: u16) -> Option<Self> {
         let location = bits & ((1 << LOCATION_BITS) - 1);
         match bits >> LOCATION_BITS {
-            KIND_NODE => Some(Self::Node(location as u8)),
+            KIND_NODE => Some(Self::Node(location)),
             KIND_LEAF => Some(Self::Leaf(location)),
-            KIND_BRICK => Some(Self::Brick(location as u8)),
+            KIND_BRICK => Some(Self::Brick(location)),
             _ => None,
         }
     }

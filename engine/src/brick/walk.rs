@@ -7,12 +7,12 @@
 
 use glam::Vec3;
 
+use super::ALIGNMENT;
 use super::bundle::{Bundle, EXTINCTION_OPAQUE, RAYS_MAX};
 use super::intersect;
-use super::lanes::{Boxes, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
+use super::lanes::{Boxes, Corners, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
 use super::leaf::{self, Layout};
-use super::node::{Child, FAR_BYTES, WIDTH};
-use super::{ALIGNMENT, Brick};
+use super::node::{Child, FAR_BYTES, Node, WIDTH};
 
 /// Where a brick is, for the current batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -83,6 +83,7 @@ pub struct Scratch {
     current: Vec<u16>,
     masks: Vec<u8>,
     boxes: Boxes,
+    corners: Corners,
     planes: Planes,
     /// Rays that met a brick which is not in memory.
     pub waiting: Vec<Waiting>,
@@ -95,17 +96,14 @@ pub struct Scratch {
 /// A node or leaf to visit, with its list of rays.
 #[derive(Clone, Copy, Debug)]
 struct Entry {
-    /// Byte address in units of 8: of the brick for nodes, of the leaf for leaves.
+    /// Byte address in units of 8.
     address: u32,
-    /// Node index, or [`LEAF`].
-    node: u16,
+    is_leaf: bool,
     /// Entries of the list.
     count: u16,
     /// First entry of the list.
     first: u32,
 }
-
-const LEAF: u16 = u16::MAX;
 
 impl Scratch {
     /// Memory for bundles of [`RAYS_MAX`] rays.
@@ -121,6 +119,7 @@ impl Scratch {
                 distance2: [0.0; WIDTH],
                 diagonal2: [0.0; WIDTH],
             },
+            corners: Corners::EMPTY,
             planes: Planes::EMPTY,
             waiting: Vec::new(),
             waiting_rays: Vec::new(),
@@ -224,8 +223,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         walk.scratch.lists[..count].copy_from_slice(rays);
         match bricks.locate(start) {
             Location::Resident(at) => walk.scratch.stack.push(Entry {
-                address: at * (ALIGNMENT / 8) as u32,
-                node: 0,
+                address: root_node(at),
+                is_leaf: false,
                 count: count as u16,
                 first: 0,
             }),
@@ -246,7 +245,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             if count == 0 {
                 continue;
             }
-            if entry.node == LEAF {
+            if entry.is_leaf {
                 // SAFETY: as the caller's
                 unsafe { walk.visit_leaf(entry.address, count) };
             } else {
@@ -262,8 +261,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
     /// The instruction set of `L` is available.
     #[inline(always)]
     unsafe fn visit_node(&mut self, entry: Entry, count: usize) {
-        let brick = Brick::trusted(&self.memory[8 * entry.address as usize..]);
-        let node = brick.node(usize::from(entry.node));
+        let at = 8 * entry.address as usize;
+        let node: &Node = bytemuck::from_bytes(&self.memory[at..at + size_of::<Node>()]);
         self.scratch.counts.nodes += 1;
         self.scratch.counts.node_rays += count as u64;
         let Scratch { current, masks, boxes, .. } = &mut *self.scratch;
@@ -272,33 +271,47 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         // SAFETY: as the caller's
         unsafe { L::boxes(node, self.bundle.reference, &self.bundle.bounds, boxes) };
         let mut targets = [Target::FarField; WIDTH];
-        let mut order = [0_u64; WIDTH];
-        let (mut opened, mut far_mask) = (0, 0_u8);
+        let mut far_mask = 0_u8;
         for slot in 0..usize::from(node.count) {
             let target = if boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot] {
                 Target::FarField
             } else {
-                Self::target(self.bricks, &brick, entry.address, node.child(slot))
+                Self::target(self.bricks, self.memory, entry.address, node.child(slot))
             };
             if target == Target::FarField {
                 far_mask |= 1 << slot;
             } else {
-                // Squared distances are not negative: their bits are in their order
-                order[opened] = u64::from(boxes.distance2[slot].to_bits()) << 8 | slot as u64;
-                opened += 1;
+                if let Target::Open { address, .. } = target {
+                    prefetch(self.memory, address);
+                }
             }
             targets[slot] = target;
         }
 
         // Test the rays
         // SAFETY: ray numbers in lists are below the bundle's length; `masks` has the slack
-        unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) };
-        if far_mask != 0 {
+        let any = unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) };
+        if any & far_mask != 0 {
             self.meet_far_fields(&node.far, far_mask, count);
         }
 
         // Open the children, far ones first, so that near ones are visited first
-        order[..opened].sort_unstable_by(|a, b| b.cmp(a));
+        let mut order = [0_u64; WIDTH];
+        let mut opened = 0;
+        let mut open_mask = any & !far_mask & (0xff_u32 >> (8 - u32::from(node.count))) as u8;
+        while open_mask != 0 {
+            let slot = open_mask.trailing_zeros() as usize;
+            open_mask &= open_mask - 1;
+            // Squared distances are not negative: their bits are in their order
+            let key = u64::from(self.scratch.boxes.distance2[slot].to_bits()) << 8 | slot as u64;
+            let mut at = opened;
+            while at > 0 && order[at - 1] < key {
+                order[at] = order[at - 1];
+                at -= 1;
+            }
+            order[at] = key;
+            opened += 1;
+        }
         let mut first = entry.first as usize;
         for &key in &order[..opened] {
             let slot = key as usize & 7;
@@ -312,9 +325,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
                 continue;
             }
             match targets[slot] {
-                Target::Open { address, node } => {
-                    prefetch(self.memory, address, node);
-                    stack.push(Entry { address, node, count: met as u16, first: first as u32 });
+                Target::Open { address, is_leaf } => {
+                    stack.push(Entry { address, is_leaf, count: met as u16, first: first as u32 });
                     first += met;
                 }
                 Target::Wait(brick) => {
@@ -328,16 +340,19 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         }
     }
 
-    /// What a child asks for. `address` is that of the brick it stands in.
+    /// What a child of the node at `address` asks for.
     #[inline(always)]
-    fn target(bricks: &B, brick: &Brick<'_>, address: u32, child: Option<Child>) -> Target {
+    fn target(bricks: &B, memory: &[u8], address: u32, child: Option<Child>) -> Target {
         match child {
-            Some(Child::Node(node)) => Target::Open { address, node: u16::from(node) },
-            Some(Child::Leaf(offset)) => Target::Open { address: address + u32::from(offset), node: LEAF },
-            Some(Child::Brick(index)) => {
-                let number = brick.child_brick(usize::from(index));
+            Some(Child::Node(offset)) => {
+                Target::Open { address: address + u32::from(offset), is_leaf: false }
+            }
+            Some(Child::Leaf(offset)) => Target::Open { address: address + u32::from(offset), is_leaf: true },
+            Some(Child::Brick(offset)) => {
+                let at = 8 * (address as usize + usize::from(offset));
+                let number = u32::from_le_bytes(memory[at..at + 4].try_into().expect("4 bytes"));
                 match bricks.locate(number) {
-                    Location::Resident(at) => Target::Open { address: at * (ALIGNMENT / 8) as u32, node: 0 },
+                    Location::Resident(at) => Target::Open { address: root_node(at), is_leaf: false },
                     Location::FarField => Target::FarField,
                     Location::Missing => Target::Wait(number),
                 }
@@ -383,6 +398,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             self.visit_round_leaf(bytes, &layout, count);
             return;
         }
+        // SAFETY: the brick was checked when it was loaded, and memory runs on past it
+        unsafe { L::corners(bytes, &layout, self.bundle.reference, &mut self.scratch.corners) };
         // Rays are in order: each origin's are a run
         let mut at = 0;
         for origin in 0..self.bundle.origins.len() {
@@ -394,8 +411,10 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             if at == start {
                 continue;
             }
-            // SAFETY: the brick was checked when it was loaded, and memory runs on past it
-            unsafe { L::planes(bytes, &layout, origin.position, &mut self.scratch.planes) };
+            let offset = origin.position.wrapping_sub(self.bundle.reference);
+            let Scratch { corners, planes, .. } = &mut *self.scratch;
+            // SAFETY: as the caller's
+            unsafe { L::planes(corners, offset, planes) };
             if self.scratch.planes.valid == 0 {
                 continue;
             }
@@ -507,7 +526,7 @@ enum Target {
         /// As in [`Entry`].
         address: u32,
         /// As in [`Entry`].
-        node: u16,
+        is_leaf: bool,
     },
     /// It is a brick that is not in memory.
     Wait(u32),
@@ -519,14 +538,19 @@ fn face_extinction(stored: u16) -> u32 {
     if stored == leaf::OPAQUE { EXTINCTION_OPAQUE } else { u32::from(stored) }
 }
 
-/// Asks for the memory of a child that will be visited soon.
+/// The address of a brick's root node in units of 8 bytes, from the brick's in units of [`ALIGNMENT`].
 #[inline(always)]
-fn prefetch(memory: &[u8], address: u32, node: u16) {
+fn root_node(brick: u32) -> u32 {
+    brick * (ALIGNMENT / 8) as u32 + (super::HEADER_BYTES / 8) as u32
+}
+
+/// Asks for the memory of a child that may be visited soon: the first two lines.
+#[inline(always)]
+fn prefetch(memory: &[u8], address: u32) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        let inside = if node == LEAF { 0 } else { super::HEADER_BYTES + usize::from(node) * 128 };
-        let at = memory.as_ptr().wrapping_add(8 * address as usize + inside);
+        let at = memory.as_ptr().wrapping_add(8 * address as usize);
         // SAFETY: prefetching never faults, whatever the address
         unsafe {
             _mm_prefetch::<_MM_HINT_T0>(at.cast());
@@ -534,7 +558,7 @@ fn prefetch(memory: &[u8], address: u32, node: u16) {
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _ = (memory, address, node);
+    let _ = (memory, address);
 }
 
 #[cfg(test)]
@@ -622,7 +646,7 @@ mod tests {
             bricks.push(brick);
         }
         let mut root = Node::over(&boxes);
-        (0..8).for_each(|slot| root.children[slot] = Child::Brick(slot as u8).encode());
+        (0..8).for_each(|slot| root.children[slot] = Child::Brick(slot as u16).encode());
         assemble(0, &mut [root], &[1, 2, 3, 4, 5, 6, 7, 8], &[], 0, &mut memory);
         for brick in bricks {
             starts.push(memory.len() as u32);

@@ -128,26 +128,48 @@ impl Chunk {
         let columns = usize::from(grid.columns);
         let rows = grid.arities.len() / columns;
         let (tile_columns, tile_rows) = tile_shape(grid, columns, rows);
-        let mut tile = [None; FACES_MAX];
         for row in (0..rows).step_by(tile_rows) {
             for column in (0..columns).step_by(tile_columns) {
-                let mut count = 0;
-                for r in row..rows.min(row + tile_rows) {
-                    for c in column..columns.min(column + tile_columns) {
+                let (across, down) = ((columns - column).min(tile_columns), (rows - row).min(tile_rows));
+                let (mut faces, mut count) = ([None; FACES_MAX], 0);
+                for r in row..row + down {
+                    for c in column..column + across {
                         let face = r * columns + c;
-                        if let Some(face) = self.face(grid, face, 4 * face) {
-                            tile[count] = Some(face);
-                            count += 1;
-                        }
+                        faces[count] = self.face(grid, face, 4 * face);
+                        count += usize::from(faces[count].is_some());
                     }
                 }
-                if count > 0 {
-                    let mut faces = [tile[0].expect("there is one"); FACES_MAX];
-                    (0..count).for_each(|i| faces[i] = tile[i].expect("filled above"));
-                    self.push(&faces[..count], grid.shift);
+                let Some(first) = faces[0] else { continue };
+                let faces = faces.map(|face| face.unwrap_or(first));
+                let faces = &faces[..count];
+                if count == across * down && faces.iter().all(|face| face.arity == 4) {
+                    self.push_tile(grid, faces, [column, row, across, down]);
+                } else {
+                    self.push(faces, grid.shift);
                 }
             }
         }
+    }
+
+    /// Encodes a whole tile of a regular grid: its first column and row, quads across and down.
+    fn push_tile(&mut self, grid: &Quantised, faces: &[Face], [column, row, across, down]: [usize; 4]) {
+        let wide = usize::from(grid.columns) + 1;
+        let (mut vertices, mut count) = ([IVec3::ZERO; leaf::VERTICES_MAX], 0);
+        for r in row..=row + down {
+            let start = r * wide + column;
+            vertices[count..count + across + 1].copy_from_slice(&grid.vertices[start..start + across + 1]);
+            count += across + 1;
+        }
+        let (mut extinctions, offset) = ([0; FACES_MAX], self.leaves.len());
+        faces.iter().zip(&mut extinctions).for_each(|(face, extinction)| *extinction = face.extinction);
+        leaf::encode_tile(
+            &vertices[..count],
+            across,
+            &extinctions[..faces.len()],
+            grid.shift,
+            &mut self.leaves,
+        );
+        self.record(faces, offset);
     }
 
     /// Cuts faces into leaves by balanced splits at multiples of eight along the longest axis.
@@ -202,6 +224,11 @@ impl Chunk {
     fn push(&mut self, faces: &[Face], shift: u8) {
         let offset = self.leaves.len();
         leaf::encode(faces, shift, &mut self.leaves);
+        self.record(faces, offset);
+    }
+
+    /// Notes the leaf that was encoded from `offset` on.
+    fn record(&mut self, faces: &[Face], offset: usize) {
         let (mut bounds, mut area, mut opaque_area) = (LatticeBox::EMPTY, 0.0, 0.0);
         for face in faces {
             bounds = bounds.union(face.bounds());

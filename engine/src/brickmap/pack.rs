@@ -141,7 +141,7 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
                     sum.micropolygons += p.micropolygons;
                     sum.bytes += match p.content {
                         Content::Leaf { bytes, .. } => bytes as usize,
-                        Content::Brick(_) => 4,
+                        Content::Brick(_) => 8,
                     };
                 }
                 WideChild::Node(child) => {
@@ -164,7 +164,7 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
             if sum.bytes <= TREELET_BYTES && sum.nodes <= CHILDREN_MAX / WIDTH {
                 break;
             }
-            sum.bytes -= subtrees[child].bytes - 4;
+            sum.bytes -= subtrees[child].bytes - 8;
             sum.nodes -= subtrees[child].nodes;
             subtrees[child].is_brick = true;
         }
@@ -202,7 +202,7 @@ impl Packer<'_> {
         }
         let (mut nodes, mut table, mut leaves) = (Vec::with_capacity(members.len()), Vec::new(), Vec::new());
         let mut micropolygons = 0;
-        let mut next_member = 1_u8;
+        let mut next_member = 1;
         for &member in &members {
             let wide = self.tree.nodes[member as usize];
             let children = &wide.children[..usize::from(wide.count)];
@@ -215,7 +215,7 @@ impl Packer<'_> {
                 let reference = match *child {
                     WideChild::Node(child) if self.subtrees[child as usize].is_brick => {
                         table.push(self.brick(child));
-                        Child::Brick((table.len() - 1) as u8)
+                        Child::Brick((table.len() - 1) as u16)
                     }
                     WideChild::Node(_) => {
                         next_member += 1;
@@ -234,7 +234,7 @@ impl Packer<'_> {
                             }
                             Content::Brick(number) => {
                                 table.push(number);
-                                Child::Brick((table.len() - 1) as u8)
+                                Child::Brick((table.len() - 1) as u16)
                             }
                         }
                     }

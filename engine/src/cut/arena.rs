@@ -7,6 +7,8 @@
 
 use std::sync::Arc;
 
+use memmap2::MmapMut;
+
 use crate::brick::leaf::READ_PAST_BYTES;
 use crate::brick::walk::{Bricks, Location};
 use crate::brick::{ALIGNMENT, BYTES_MAX, Brick};
@@ -14,6 +16,11 @@ use crate::brickmap::BrickMap;
 use crate::{Error, ErrorKind, Result};
 
 const NONE: u32 = u32::MAX;
+
+/// A place: in the cut, but not loaded.
+const MISSING: u32 = u32::MAX;
+/// A place: not in the cut.
+const NOT_IN_CUT: u32 = u32::MAX - 1;
 
 /// Bytes that one read from storage asks for at most, when bricks are neighbours on disk.
 const READ_BYTES_MAX: usize = 1 << 20;
@@ -48,16 +55,12 @@ struct Slot {
     newer: u32,
 }
 
-/// A 64-byte line: what makes the arena's memory aligned.
-#[derive(Clone, Copy, Debug, bytemuck::Zeroable, bytemuck::Pod)]
-#[repr(C, align(64))]
-struct Line([u8; ALIGNMENT]);
-
 /// The memory that holds loaded bricks.
 #[derive(Debug)]
 pub struct Arena {
     map: Arc<BrickMap>,
-    lines: Vec<Line>,
+    /// Anonymous memory, aligned to pages.
+    memory: MmapMut,
     capacity: u32,
     slot_of: Vec<u32>,
     slots: Vec<Slot>,
@@ -70,8 +73,12 @@ pub struct Arena {
     rover: u32,
     /// The current batch; slots with this mark must stay.
     batch: u32,
-    /// Per brick, the batch whose cut it was last in; empty when every brick is in every cut.
-    in_cut: Vec<u32>,
+    /// Whether every brick is in every cut.
+    everything: bool,
+    /// The bricks of the current cut, unless everything is.
+    cut: Vec<u32>,
+    /// Per brick, what a walk asks for: its address, [`MISSING`] or [`NOT_IN_CUT`]. One look-up a brick.
+    places: Vec<u32>,
     staging: Vec<u8>,
     /// What was counted.
     pub counts: ArenaCounts,
@@ -91,10 +98,19 @@ impl Arena {
                 .hint(format!("at least {smallest} bytes are needed: raise `--memory`")));
         }
         let capacity = (wanted / ALIGNMENT as u64) as u32;
+        // Zeroed by the operating system, page by page as bricks come in
+        let memory = MmapMut::map_anon(capacity as usize * ALIGNMENT + READ_PAST_BYTES).map_err(|error| {
+            Error::new(ErrorKind::Limit, format!("cannot get an arena of {wanted} bytes: {error}"))
+                .hint("lower `--memory`")
+        })?;
+        // Walks jump about in all of it: large pages save a miss of the address cache at nearly every visit
+        #[cfg(target_os = "linux")]
+        if let Err(error) = memory.advise(memmap2::Advice::HugePage) {
+            tracing::debug!("no huge pages for the arena: {error}");
+        }
         let bricks = map.brick_count() as usize;
         Ok(Self {
-            // Zeroed by the operating system, page by page as bricks come in
-            lines: bytemuck::zeroed_vec(capacity as usize + READ_PAST_BYTES.div_ceil(ALIGNMENT)),
+            memory,
             capacity,
             slot_of: vec![NONE; bricks],
             slots: Vec::new(),
@@ -106,7 +122,9 @@ impl Arena {
             free: capacity,
             rover: NONE,
             batch: 0,
-            in_cut: if everything { Vec::new() } else { vec![0; bricks] },
+            everything,
+            cut: Vec::new(),
+            places: vec![if everything { MISSING } else { NOT_IN_CUT }; bricks],
             staging: Vec::new(),
             map,
             counts: ArenaCounts::default(),
@@ -118,22 +136,36 @@ impl Arena {
         &self.map
     }
 
-    /// Starts a new batch: bricks loaded or touched from now on stay until the next one starts.
+    /// Starts a new batch with an empty cut: bricks loaded or touched from now on stay until the next one starts.
     pub fn begin_batch(&mut self) {
         self.batch += 1;
+        for brick in std::mem::take(&mut self.cut) {
+            self.places[brick as usize] = NOT_IN_CUT;
+        }
     }
 
-    /// Lets bricks of the current batch go, as [`begin_batch`](Self::begin_batch) does, but keeps its cut.
+    /// Lets bricks of the current batch go, but keeps its cut.
     pub fn release(&mut self) {
-        let old = self.batch;
         self.batch += 1;
-        self.in_cut.iter_mut().filter(|batch| **batch == old).for_each(|batch| *batch = old + 1);
     }
 
-    /// Marks bricks as belonging to the current batch's cut.
+    /// Adds bricks to the current batch's cut.
     pub fn add_to_cut(&mut self, bricks: &[u32]) {
-        if !self.in_cut.is_empty() {
-            bricks.iter().for_each(|&brick| self.in_cut[brick as usize] = self.batch);
+        if self.everything {
+            return;
+        }
+        self.cut.extend_from_slice(bricks);
+        for &brick in bricks {
+            let slot = self.slot_of[brick as usize];
+            self.places[brick as usize] = if slot == NONE { MISSING } else { self.slots[slot as usize].at };
+        }
+    }
+
+    /// Notes where a brick is now, if it is in the cut.
+    fn note_place(&mut self, brick: u32, place: u32) {
+        let known = &mut self.places[brick as usize];
+        if *known != NOT_IN_CUT {
+            *known = place;
         }
     }
 
@@ -227,8 +259,7 @@ impl Arena {
             }
             let place = self.place(lines);
             let start = place as usize * ALIGNMENT;
-            bytemuck::cast_slice_mut::<Line, u8>(&mut self.lines)[start..start + length]
-                .copy_from_slice(&staging[at..at + length]);
+            self.memory[start..start + length].copy_from_slice(&staging[at..at + length]);
             self.insert(brick, place, lines);
             self.counts.misses += 1;
             at += length;
@@ -282,8 +313,9 @@ impl Arena {
             if at > hole {
                 let (from, to, bytes) =
                     (at as usize * ALIGNMENT, hole as usize * ALIGNMENT, length as usize * ALIGNMENT);
-                bytemuck::cast_slice_mut::<Line, u8>(&mut self.lines).copy_within(from..from + bytes, to);
+                self.memory.copy_within(from..from + bytes, to);
                 self.slots[slot as usize].at = hole;
+                self.note_place(self.slots[slot as usize].brick, hole);
                 self.counts.moved_bytes += bytes as u64;
             }
             if above == NONE {
@@ -331,6 +363,7 @@ impl Arena {
             slot;
         self.newest = slot;
         self.slot_of[brick as usize] = slot;
+        self.note_place(brick, at);
         self.free -= length;
     }
 
@@ -344,6 +377,7 @@ impl Arena {
             self.rover = above;
         }
         self.slot_of[brick as usize] = NONE;
+        self.note_place(brick, MISSING);
         self.free_slots.push(slot);
         self.free += length;
     }
@@ -370,15 +404,15 @@ impl Arena {
 
 impl Bricks for Arena {
     fn memory(&self) -> &[u8] {
-        bytemuck::cast_slice(&self.lines)
+        &self.memory
     }
 
     #[inline(always)]
     fn locate(&self, brick: u32) -> Location {
-        if !self.in_cut.is_empty() && self.in_cut[brick as usize] != self.batch {
-            return Location::FarField;
+        match self.places[brick as usize] {
+            NOT_IN_CUT => Location::FarField,
+            MISSING => Location::Missing,
+            place => Location::Resident(place),
         }
-        let slot = self.slot_of[brick as usize];
-        if slot == NONE { Location::Missing } else { Location::Resident(self.slots[slot as usize].at) }
     }
 }

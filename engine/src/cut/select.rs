@@ -151,15 +151,16 @@ fn open_children(
     let mut depth = 1;
     while depth > 0 {
         depth -= 1;
-        let node = brick.node(usize::from(stack[depth]));
+        let index = usize::from(stack[depth]);
+        let node = brick.node(index);
         for slot in 0..usize::from(node.count) {
             match node.child(slot) {
                 Some(Child::Node(child)) if is_open(node, slot, batch, node_open2) => {
-                    stack[depth] = child;
+                    stack[depth] = brick.child_node(index, child) as u8;
                     depth += 1;
                 }
                 Some(Child::Brick(child)) if is_open(node, slot, batch, brick_open2) => {
-                    next.push(brick.child_brick(usize::from(child)));
+                    next.push(brick.child_brick_at(index, child));
                 }
                 _ => {}
             }

@@ -8,7 +8,7 @@ use std::arch::x86_64::*;
 use glam::{IVec3, Vec3};
 
 use super::plain::{BOX_ERROR, Plain};
-use super::{Boxes, Lanes, Planes, SLACK};
+use super::{Boxes, Corners, Lanes, Planes, SLACK};
 use crate::brick::bundle::{BoxRay, RAYS_MAX};
 use crate::brick::leaf::{HEADER_BYTES, Layout};
 use crate::brick::node::Node;
@@ -79,7 +79,7 @@ impl Lanes for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) {
+    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8 {
         debug_assert!(masks.len() >= ids.len());
         // SAFETY: ids are below the number of rays; there is a mask for each
         unsafe {
@@ -89,6 +89,7 @@ impl Lanes for Avx512 {
                 center[axis] = _mm256_loadu_ps(boxes.center[axis].as_ptr());
                 half[axis] = _mm256_loadu_ps(boxes.half[axis].as_ptr());
             }
+            let mut any = 0;
             for (i, &id) in ids.iter().enumerate() {
                 let ray = rays.get_unchecked(usize::from(id));
                 let mut enter = _mm256_setzero_ps();
@@ -101,8 +102,11 @@ impl Lanes for Avx512 {
                     enter = _mm256_max_ps(_mm256_fnmadd_ps(half[axis], steep, middle), enter);
                     leave = _mm256_min_ps(_mm256_fmadd_ps(half[axis], steep, middle), leave);
                 }
-                *masks.get_unchecked_mut(i) = _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave);
+                let met = _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave);
+                *masks.get_unchecked_mut(i) = met;
+                any |= met;
             }
+            any
         }
     }
 
@@ -129,85 +133,95 @@ impl Lanes for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn planes(leaf: &[u8], layout: &Layout, origin: IVec3, out: &mut Planes) {
-        if layout.bits.iter().any(|&bits| bits > LANE_BITS_MAX) {
+    unsafe fn corners(leaf: &[u8], layout: &Layout, reference: IVec3, out: &mut Corners) {
+        if layout.bits[0].max(layout.bits[1]).max(layout.bits[2]) > LANE_BITS_MAX {
             // SAFETY: the caller's
-            return unsafe { Plain::planes(leaf, layout, origin, out) };
+            return unsafe { Plain::corners(leaf, layout, reference, out) };
         }
         debug_assert!(leaf.len() >= layout.bytes + crate::brick::leaf::READ_PAST_BYTES);
-        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 32 bytes from byte 20,
+        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 20 bytes from byte 20,
         // and 16 coordinates start within the leaf
         unsafe {
-            // Unpack the vertices relative to the origin
+            // Unpack the vertices relative to the reference
             let many = layout.vertices > 16;
             let zero = _mm512_setzero_si512();
             let (mut first, mut second) = ([zero; 3], [zero; 3]);
-            let mut at_origin = [!0_u16; 2];
             for axis in 0..3 {
                 let bits = layout.bits[axis];
-                let base = _mm512_set1_epi32(layout.origin[axis].wrapping_sub(origin[axis]));
+                let base = _mm512_set1_epi32(layout.origin[axis].wrapping_sub(reference[axis]));
                 let shift = _mm_cvtsi32_si128(i32::from(layout.shift));
                 let packed = leaf.as_ptr().add(layout.coordinates[axis]);
                 first[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpack(packed, bits), shift), base);
-                at_origin[0] &= _mm512_cmpeq_epi32_mask(first[axis], zero);
                 if many {
                     let packed = packed.add(2 * usize::from(bits));
                     second[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpack(packed, bits), shift), base);
-                    at_origin[1] &= _mm512_cmpeq_epi32_mask(second[axis], zero);
                 }
             }
 
             // Read the corners' indices, 8 faces at a time
             let indices = leaf.as_ptr().add(HEADER_BYTES);
-            let corner: [__m256i; 4] = if layout.byte_indices {
-                let words = _mm256_loadu_si256(indices.cast());
-                let mask = _mm256_set1_epi32(31);
+            let corner: [__m256i; 4] = if layout.columns > 0 {
+                let face = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
+                // face / columns for up to 8 of each, by multiplication
+                let inverse = _mm256_set1_epi32(256_i32.div_euclid(layout.columns as i32) + 1);
+                let row = _mm256_srli_epi32::<8>(_mm256_mullo_epi32(face, inverse));
+                let first = _mm256_add_epi32(face, row);
+                let wide = layout.columns as i32 + 1;
                 [
-                    _mm256_and_si256(words, mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<8>(words), mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<16>(words), mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<24>(words), mask),
+                    first,
+                    _mm256_add_epi32(first, _mm256_set1_epi32(1)),
+                    _mm256_add_epi32(first, _mm256_set1_epi32(wide + 1)),
+                    _mm256_add_epi32(first, _mm256_set1_epi32(wide)),
                 ]
             } else {
-                let words = _mm256_cvtepu16_epi32(_mm_loadu_si128(indices.cast()));
-                let mask = _mm256_set1_epi32(15);
-                [
-                    _mm256_and_si256(words, mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<4>(words), mask),
-                    _mm256_and_si256(_mm256_srli_epi32::<8>(words), mask),
-                    _mm256_srli_epi32::<12>(words),
-                ]
+                let bits = layout.index_bits as i64;
+                let shifts =
+                    _mm512_mullo_epi64(_mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0), _mm512_set1_epi64(bits));
+                let mask = _mm512_set1_epi64((1 << bits) - 1);
+                let mut corner = [_mm256_setzero_si256(); 4];
+                for (c, corner) in corner.iter_mut().enumerate() {
+                    let word = indices.add(c * layout.index_bits).cast::<i64>().read_unaligned();
+                    let spread = _mm512_srlv_epi64(_mm512_set1_epi64(word), shifts);
+                    *corner = _mm512_cvtepi64_epi32(_mm512_and_si512(spread, mask));
+                }
+                corner
             };
             let lanes = [pair(corner[0], corner[0]), pair(corner[1], corner[2]), pair(corner[2], corner[3])];
 
-            // Exclude faces with a corner at the origin
-            let present = ((1_u32 << layout.faces) - 1) as u16;
-            let mut valid = present | present << 8;
-            let touched = u32::from(at_origin[0]) | u32::from(if many { at_origin[1] } else { 0 }) << 16;
-            let touched = if layout.vertices < 32 { touched & ((1 << layout.vertices) - 1) } else { touched };
-            if touched != 0 {
-                let bits = _mm256_set1_epi32(touched as i32);
-                let mut any = _mm256_setzero_si256();
-                for c in corner {
-                    any = _mm256_or_si256(any, _mm256_srlv_epi32(bits, c));
-                }
-                let excluded = u16::from(_mm256_test_epi32_mask(any, _mm256_set1_epi32(1)));
-                valid &= !(excluded | excluded << 8);
-            }
-
             // Gather the corners
-            let mut corners = [[_mm512_setzero_ps(); 3]; 3];
             for axis in 0..3 {
-                let low = _mm512_cvtepi32_ps(first[axis]);
-                let high = _mm512_cvtepi32_ps(second[axis]);
                 for c in 0..3 {
-                    corners[c][axis] = if many {
-                        _mm512_permutex2var_ps(low, lanes[c], high)
+                    let gathered = if many {
+                        _mm512_permutex2var_epi32(first[axis], lanes[c], second[axis])
                     } else {
-                        _mm512_permutexvar_ps(lanes[c], low)
+                        _mm512_permutexvar_epi32(lanes[c], first[axis])
                     };
+                    _mm512_storeu_si512(out.coordinates[c][axis].as_mut_ptr().cast(), gathered);
                 }
             }
+            let present = ((1_u32 << layout.faces) - 1) as u16;
+            out.present = present | present << 8;
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn planes(source: &Corners, offset: IVec3, out: &mut Planes) {
+        // SAFETY: arrays of 16
+        unsafe {
+            // Exclude faces with a corner at the origin, both triangles of them
+            let mut corners = [[_mm512_setzero_ps(); 3]; 3];
+            let mut touches = 0_u16;
+            for (corner, from) in corners.iter_mut().zip(&source.coordinates) {
+                let mut at_origin = u16::MAX;
+                for axis in 0..3 {
+                    let coordinates = _mm512_loadu_si512(from[axis].as_ptr().cast());
+                    let relative = _mm512_sub_epi32(coordinates, _mm512_set1_epi32(offset[axis]));
+                    at_origin = _mm512_mask_testn_epi32_mask(at_origin, relative, relative);
+                    corner[axis] = _mm512_cvtepi32_ps(relative);
+                }
+                touches |= at_origin;
+            }
+            let mut valid = source.present & !(touches | touches >> 8 | touches << 8);
 
             // Make the planes; products are not fused, see the plain version
             let [a, b, c] = corners;

@@ -30,8 +30,23 @@ pub struct Boxes {
     pub diagonal2: [f32; WIDTH],
 }
 
-/// Triangles of a leaf, seen from one origin: lanes 0 to 7 have the first triangles of faces 0 to 7, lanes 8 to 15 the
-/// second ones.
+/// Corners of a leaf's triangles relative to a bundle's reference, in lattice steps: lanes 0 to 7 have the first triangles of
+/// faces 0 to 7, lanes 8 to 15 the second ones.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+pub struct Corners {
+    /// Coordinates: corner, axis, lane.
+    pub coordinates: [[[i32; 16]; 3]; 3],
+    /// Lanes that hold a triangle.
+    pub present: u16,
+}
+
+impl Corners {
+    /// No triangles.
+    pub const EMPTY: Self = Self { coordinates: [[[0; 16]; 3]; 3], present: 0 };
+}
+
+/// Triangles of a leaf, seen from one origin, in the same lanes.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 pub struct Planes {
@@ -68,12 +83,12 @@ pub trait Lanes {
     /// See the trait.
     unsafe fn boxes(node: &Node, reference: IVec3, origins: &[glam::Vec3; 2], out: &mut Boxes);
 
-    /// Writes to `masks`, for each of `ids`, the boxes that its ray meets, one bit a box. `masks` is at least
-    /// `ids.len() + SLACK` long.
+    /// Writes to `masks`, for each of `ids`, the boxes that its ray meets, one bit a box, and returns the boxes that any
+    /// meets. `masks` is at least `ids.len() + SLACK` long.
     ///
     /// # Safety
     /// See the trait.
-    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]);
+    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8;
 
     /// Writes those of `ids` whose mask has bit `slot` to `out`, in order, and returns how many. `out` is at least
     /// `ids.len() + SLACK` long, `masks` too.
@@ -82,12 +97,19 @@ pub trait Lanes {
     /// See the trait.
     unsafe fn select(ids: &[u16], masks: &[u8], slot: usize, out: &mut [u16]) -> usize;
 
-    /// Decodes the triangles of a flat leaf as seen from `origin`.
+    /// Decodes the triangles of a flat leaf.
     ///
     /// # Safety
     /// See the trait. `leaf` was checked and runs on past its end by
     /// [`READ_PAST_BYTES`](super::leaf::READ_PAST_BYTES).
-    unsafe fn planes(leaf: &[u8], layout: &Layout, origin: IVec3, out: &mut Planes);
+    unsafe fn corners(leaf: &[u8], layout: &Layout, reference: IVec3, out: &mut Corners);
+
+    /// Turns triangles into planes as seen from an origin, which lies at `offset` from the reference. Faces with a corner at
+    /// the origin are left out.
+    ///
+    /// # Safety
+    /// See the trait.
+    unsafe fn planes(corners: &Corners, offset: IVec3, out: &mut Planes);
 
     /// The triangles that a ray meets, one bit a lane.
     ///

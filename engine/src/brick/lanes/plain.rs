@@ -2,7 +2,7 @@
 
 use glam::{IVec3, Vec3};
 
-use super::{Boxes, Lanes, Planes};
+use super::{Boxes, Corners, Lanes, Planes};
 use crate::brick::bundle::{BoxRay, RAYS_MAX};
 use crate::brick::leaf::{FACES_MAX, Layout, VERTICES_MAX};
 use crate::brick::node::{Node, WIDTH};
@@ -51,7 +51,8 @@ impl Lanes for Plain {
     }
 
     #[inline(always)]
-    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) {
+    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8 {
+        let mut any = 0;
         for (&id, mask) in ids.iter().zip(masks) {
             let ray = &rays[usize::from(id)];
             let mut enter = [0.0_f32; WIDTH];
@@ -66,7 +67,9 @@ impl Lanes for Plain {
                 }
             }
             *mask = (0..WIDTH).fold(0, |mask, slot| mask | u8::from(enter[slot] <= leave[slot]) << slot);
+            any |= *mask;
         }
+        any
     }
 
     #[inline(always)]
@@ -80,30 +83,44 @@ impl Lanes for Plain {
     }
 
     #[inline(always)]
-    unsafe fn planes(leaf: &[u8], layout: &Layout, origin: IVec3, out: &mut Planes) {
+    unsafe fn corners(leaf: &[u8], layout: &Layout, reference: IVec3, out: &mut Corners) {
         let mut vertices = [[0_i32; VERTICES_MAX]; 3];
-        let mut at_origin = 0_u32;
         for vertex in 0..layout.vertices {
             let position = layout.vertex(leaf, vertex);
-            let relative = [0, 1, 2].map(|axis| position[axis].wrapping_sub(origin[axis]));
-            at_origin |= u32::from(relative == [0; 3]) << vertex;
             for axis in 0..3 {
-                vertices[axis][vertex] = relative[axis];
+                vertices[axis][vertex] = position[axis].wrapping_sub(reference[axis]);
             }
         }
-        let mut corners = [[[0.0_f32; 16]; 3]; 3];
-        let mut excluded = 0_u16;
         for face in 0..FACES_MAX.min(layout.faces) {
             let indices = [0, 1, 2, 3].map(|corner| layout.index(leaf, face, corner) % VERTICES_MAX);
-            let touches = indices.iter().any(|&index| at_origin >> index & 1 != 0);
-            excluded |= u16::from(touches) * (0x101 << face);
             for axis in 0..3 {
-                let [a, b, c, d] = indices.map(|index| vertices[axis][index] as f32);
-                (corners[0][axis][face], corners[0][axis][face + 8]) = (a, a);
-                (corners[1][axis][face], corners[1][axis][face + 8]) = (b, c);
-                (corners[2][axis][face], corners[2][axis][face + 8]) = (c, d);
+                let [a, b, c, d] = indices.map(|index| vertices[axis][index]);
+                (out.coordinates[0][axis][face], out.coordinates[0][axis][face + 8]) = (a, a);
+                (out.coordinates[1][axis][face], out.coordinates[1][axis][face + 8]) = (b, c);
+                (out.coordinates[2][axis][face], out.coordinates[2][axis][face + 8]) = (c, d);
             }
         }
+        let present = ((1_u32 << layout.faces) - 1) as u16;
+        out.present = present | present << 8;
+    }
+
+    #[inline(always)]
+    unsafe fn planes(source: &Corners, offset: IVec3, out: &mut Planes) {
+        let mut corners = [[[0.0_f32; 16]; 3]; 3];
+        let mut touches = 0_u16;
+        for (corner, from) in corners.iter_mut().zip(&source.coordinates) {
+            let mut at_origin = u16::MAX;
+            for axis in 0..3 {
+                for lane in 0..16 {
+                    let relative = from[axis][lane].wrapping_sub(offset[axis]);
+                    corner[axis][lane] = relative as f32;
+                    at_origin &= !(u16::from(relative != 0) << lane);
+                }
+            }
+            touches |= at_origin;
+        }
+        // Both triangles of a quad are left out
+        let excluded = touches | touches >> 8 | touches << 8;
         let [a, b, c] = &corners;
         let edges = [[a, b], [b, c], [c, a]];
         // Products are not fused: both faces of an edge get the same numbers with opposite signs
@@ -125,8 +142,7 @@ impl Lanes for Plain {
             out.volume[lane] = volume.abs();
             valid |= u16::from(volume != 0.0) << lane;
         }
-        let present = ((1_u32 << layout.faces) - 1) as u16;
-        out.valid = valid & !excluded & (present | present << 8);
+        out.valid = valid & !excluded & source.present;
     }
 
     #[inline(always)]
