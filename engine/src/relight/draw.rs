@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use super::raster::{Brush, Paint, Rows};
+use super::raster::{Brush, FaceId, Paint, Rows};
 use super::transfer::Transfer;
 use super::view::{STEPS, Vertex, View};
 use crate::Result;
@@ -273,7 +273,8 @@ impl Slot {
                 continue;
             }
             let salt = if opacity < 1.0 { combine(self.number, number as u32) } else { 0 };
-            let brush = Brush { id: self.number, salt, opacity };
+            let id = FaceId { grid: self.number, face: number as u32 };
+            let brush = Brush { id, salt, opacity };
             let vertex = |corner: usize| &self.vertices[usize::from(face[corner])];
             match face.len() {
                 1 => self.draw_point(usize::from(face[0]), POINT_RADIUS_MIN_PIXELS, brush, view, rows),

@@ -2,7 +2,7 @@
 //!
 //! Outgoing radiance is albedo/π times the triple product of light, visibility and clamped cosine in spherical
 //! harmonics: [`environment`] and [`sky`] make the light, [`transfer`] multiplies, [`view`], [`raster`] and [`draw`]
-//! put grids into a z-buffer, [`picture`] writes files. [`visible`] tells which grids a camera sees at all.
+//! put grids into a z-buffer, [`picture`] writes files. [`visible`] tells which faces a camera sees at all.
 
 pub mod draw;
 pub mod environment;
@@ -20,7 +20,7 @@ pub use environment::{Environment, Sun, Window, scene_from_map};
 pub use latlong::LatLong;
 pub use picture::Picture;
 pub use sky::{Sky, SunPosition};
-pub use visible::{VisibleGrids, visible_grids};
+pub use visible::{Visible, VisibleFaces, visible_faces};
 
 #[cfg(test)]
 mod tests;
@@ -192,7 +192,10 @@ fn shading(schema: &Schema, options: &RelightOptions) -> Result<Shading> {
 }
 
 /// The column of visibility coefficients: the one that is asked for, else the first that is named after occlusion.
-fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
+///
+/// # Errors
+/// [`ErrorKind::NotFound`] when there is none, [`ErrorKind::Invalid`] when the one asked for cannot be coefficients.
+pub fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
     const STANDARD: [&str; 8] = [
         names::NORMAL,
         names::RADIUS,

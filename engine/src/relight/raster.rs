@@ -10,26 +10,35 @@ pub trait Paint: Copy + Send + Sync {
     /// An empty sample's value.
     const EMPTY: Self;
 
-    /// The value inside a triangle, of corners' weights that sum to 1, of the grid `id`.
-    fn mix(corners: [&Vertex; 3], weights: [f32; 3], id: u32) -> Self;
+    /// The value inside a triangle, of corners' weights that sum to 1, of the face `id`.
+    fn mix(corners: [&Vertex; 3], weights: [f32; 3], id: FaceId) -> Self;
 }
 
 impl Paint for [f32; 3] {
     const EMPTY: Self = [0.0; 3];
 
     #[inline]
-    fn mix([a, b, c]: [&Vertex; 3], [wa, wb, wc]: [f32; 3], _: u32) -> Self {
+    fn mix([a, b, c]: [&Vertex; 3], [wa, wb, wc]: [f32; 3], _: FaceId) -> Self {
         std::array::from_fn(|i| wa * a.rgb[i] + wb * b.rgb[i] + wc * c.rgb[i])
     }
 }
 
-impl Paint for u32 {
-    const EMPTY: Self = Self::MAX;
+impl Paint for FaceId {
+    const EMPTY: Self = Self { grid: u32::MAX, face: u32::MAX };
 
     #[inline]
-    fn mix(_: [&Vertex; 3], _: [f32; 3], id: u32) -> Self {
+    fn mix(_: [&Vertex; 3], _: [f32; 3], id: Self) -> Self {
         id
     }
+}
+
+/// A face of a stream. The order is the stream's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct FaceId {
+    /// The grid's number in the stream.
+    pub grid: u32,
+    /// The face's number in the grid.
+    pub face: u32,
 }
 
 /// A sample: the nearest thing drawn there.
@@ -59,8 +68,8 @@ pub struct Rows<'a, P> {
 /// Who is being drawn, and how much of it is there.
 #[derive(Clone, Copy, Debug)]
 pub struct Brush {
-    /// The grid's number.
-    pub id: u32,
+    /// The face.
+    pub id: FaceId,
     /// Distinguishes faces for `opacity`.
     pub salt: u32,
     /// Share of samples that the face covers, chosen by a hash of face and sample.
@@ -186,7 +195,7 @@ fn middles(coordinates: &[i32], first: usize, count: usize) -> Option<(usize, us
 mod tests {
     use super::*;
 
-    const BRUSH: Brush = Brush { id: 7, salt: 1, opacity: 1.0 };
+    const BRUSH: Brush = Brush { id: FaceId { grid: 7, face: 0 }, salt: 1, opacity: 1.0 };
 
     fn corner(x: f32, y: f32, depth: f32, rgb: [f32; 3]) -> Vertex {
         let screen = [x, y].map(|c| (c * STEPS as f32) as i32);

@@ -23,6 +23,7 @@ use std::path::{Path, PathBuf};
 use glam::DMat4;
 
 pub use self::instances::{InstanceReader, for_each_instance};
+pub use self::parse::UNITS;
 pub use self::xml::{DEPTH_MAX, ELEMENTS_MAX, SCENE_BYTES_MAX, VALUE_BYTES_MAX};
 pub use crate::stream::schema::UpAxis;
 use crate::{Error, ErrorKind, Result};

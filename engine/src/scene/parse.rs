@@ -19,8 +19,8 @@ const SIDE_MAX: u64 = 65_536;
 /// Pixels of a picture at most, 16,384².
 const PIXELS_MAX: u64 = 1 << 28;
 
-/// Metres per unit.
-pub(super) const UNITS: [(&str, f64); 7] =
+/// The units that a scene may stand in, and metres per unit.
+pub const UNITS: [(&str, f64); 7] =
     [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("km", 1000.0), ("in", 0.0254), ("ft", 0.3048), ("yd", 0.9144)];
 
 /// Makes a scene of a document.

@@ -169,7 +169,7 @@ fn the_documented_example_is_valid() {
 fn schema_and_documentation_know_every_word() {
     let schema = std::fs::read_to_string(repository().join("docs/scene.xsd")).unwrap();
     let documentation = std::fs::read_to_string(repository().join("docs/scene.md")).unwrap();
-    let units = parse::UNITS.map(|(unit, _)| unit);
+    let units = UNITS.map(|(unit, _)| unit);
     let types = shader::TYPES.map(|(name, _)| name);
     let words = [&units[..], &types, &shader::SH_OCCLUSION, &geometry::FILTERS].concat();
     for word in words {

@@ -1,0 +1,252 @@
+//! `pantaray bake`: every bake set of a scene, decorated.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use engine::bake::{BakeOptions, bake};
+use engine::brickmap::FarField;
+use engine::cut::Lod;
+use engine::stats::{BakeSetReport, Report};
+use engine::{Error, ErrorKind, Result, scene};
+
+use crate::console::{Answer, Console};
+use crate::{figures, values};
+
+/// Bake a scene: DIR/<bake set>.mgs for each bake set, and DIR/report.json
+///
+/// Run again after an interruption, the same command continues where it was, and the result is the same bytes.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// The scene file, .xml
+    scene: PathBuf,
+    /// The folder of the results; made if it is not there
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// What traces: auto or cpu
+    #[arg(long, default_value = "auto", value_parser = Device::parse)]
+    device: Device,
+    #[command(flatten)]
+    resources: Resources,
+    /// Rays per point, instead of the shaders' own numbers
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(16..=65_536))]
+    samples: Option<u32>,
+    /// How far bricks are opened: `off` (all the way), `paper`, or `footprint[:Q]`, down to Q footprints of a ray
+    #[arg(long, value_name = "LOD", default_value = "off", value_parser = parse_lod)]
+    lod: Lod,
+    /// What stands in for what is not opened: paper
+    #[arg(long, value_name = "KIND", default_value = "paper", value_parser = Far::parse)]
+    farfield: Far,
+    /// Turns every point's rays differently; the same seed gives the same bytes
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    seed: u64,
+    /// The frame that patterns such as `####` in the scene's paths stand for
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    frame: Option<i64>,
+    /// Bake whole batches only, evenly spaced, up to about N points of each bake set; `baked` marks them
+    #[arg(long, value_name = "N", value_parser = values::count)]
+    max_points: Option<u64>,
+    /// Begin anew where the folder holds an unfinished bake
+    #[arg(long)]
+    restart: bool,
+}
+
+/// What work may use of the machine.
+#[derive(Clone, Debug, Args)]
+pub struct Resources {
+    /// Anonymous memory that the process may take, from 256MiB up
+    #[arg(long, value_name = "SIZE", default_value = "1GiB", value_parser = values::size)]
+    pub memory: u64,
+    /// Worker threads [default: one per core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub threads: Option<u16>,
+}
+
+impl Resources {
+    /// The options of a bake that may use this much.
+    pub fn options(&self) -> BakeOptions {
+        let options = BakeOptions::default();
+        let threads = self.threads.map_or(options.threads, usize::from);
+        BakeOptions { memory_bytes: self.memory, threads, ..options }
+    }
+}
+
+/// Bakes and says how it went.
+pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
+    arguments.device.check()?;
+    let scene = scene::load_frame(&arguments.scene, arguments.frame)?;
+    let options = BakeOptions {
+        lod: arguments.lod,
+        far_field: arguments.farfield.check()?,
+        seed: arguments.seed,
+        samples: arguments.samples,
+        points_max: arguments.max_points,
+        restart: arguments.restart,
+        ..arguments.resources.options()
+    };
+    let report = bake(&scene, &options, &arguments.output, console.control()).map_err(continuable)?;
+    let mut text = describe(&report);
+    for set in &report.bake_sets {
+        text.push_str(&format!("\n{}", arguments.output.join(format!("{}.mgs", set.name)).display()));
+    }
+    Answer::new(&report, text)
+}
+
+/// Says how to go on after a cancellation.
+pub fn continuable(error: Error) -> Error {
+    match error.kind() {
+        ErrorKind::Cancelled => error.hint("run the same command again to continue"),
+        _ => error,
+    }
+}
+
+/// A report as a few lines for people.
+pub fn describe(report: &Report) -> String {
+    let mut lines = vec![describe_map(report)];
+    let bake = &report.bake;
+    if !report.bake_sets.is_empty() {
+        lines.push(format!(
+            "traced     {} rays for {} points in {}: {} rays/s on {} threads ({}, {})",
+            figures::short(bake.rays as f64),
+            figures::count(bake.points),
+            figures::seconds(bake.seconds),
+            figures::short(bake.rays_per_second),
+            bake.threads,
+            bake.device,
+            bake.instructions,
+        ));
+        lines.push(format!(
+            "loaded     {:.2} bytes per ray, {:.2} % of brick requests answered from memory",
+            bake.io_bytes_per_ray,
+            100.0 * bake.cache_hit_ratio,
+        ));
+    }
+    lines.extend(report.bake_sets.iter().map(describe_set));
+    lines.push(format!(
+        "altogether {}, peak resident memory {}",
+        figures::seconds(report.seconds),
+        figures::bytes(report.peak_rss_bytes)
+    ));
+    lines.extend(
+        report
+            .skipped
+            .iter()
+            .map(|(reason, times)| format!("left out   {}: {reason}", figures::count(*times))),
+    );
+    lines.extend(report.warnings.iter().map(|warning| format!("warning    {warning}")));
+    lines.join("\n")
+}
+
+fn describe_map(report: &Report) -> String {
+    let map = &report.brickmap;
+    let how = match map.reused {
+        true => "reused".into(),
+        false => format!(
+            "built in {}, {} micropolygons/s",
+            figures::seconds(map.seconds),
+            figures::short(map.micropolygons_per_second)
+        ),
+    };
+    format!(
+        "brick map  {} micropolygons in {} bricks, {} ({:.1} bytes each), {how}",
+        figures::count(report.micropolygons),
+        figures::count(map.bricks),
+        figures::bytes(map.bytes),
+        map.bytes_per_micropolygon,
+    )
+}
+
+fn describe_set(set: &BakeSetReport) -> String {
+    let continued = match set.batches_continued {
+        0 => String::new(),
+        batches => format!(", {} of its batches from before", figures::count(batches)),
+    };
+    format!(
+        "bake set   {}: {} of {} points{continued}; split in {}, merged in {}",
+        set.name,
+        figures::count(set.points),
+        figures::count(set.stream_points),
+        figures::seconds(set.split_seconds),
+        figures::seconds(set.merge_seconds),
+    )
+}
+
+/// What traces.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Device {
+    Cpu,
+    /// Known to the grammar, not to this version.
+    Later(String),
+}
+
+impl Device {
+    fn parse(text: &str) -> Result<Self, String> {
+        let gpu_number = text.strip_prefix("gpu:").is_some_and(|number| number.parse::<u16>().is_ok());
+        match text {
+            "auto" | "cpu" => Ok(Self::Cpu),
+            "gpu" | "software" | "all" => Ok(Self::Later(text.into())),
+            _ if gpu_number => Ok(Self::Later(text.into())),
+            _ => Err("expected `auto` or `cpu`".into()),
+        }
+    }
+
+    fn check(&self) -> Result<()> {
+        match self {
+            Self::Cpu => Ok(()),
+            Self::Later(name) => Err(Error::unsupported(format!("device `{name}` is not supported yet"))
+                .hint("use `--device cpu`, or leave it out")),
+        }
+    }
+}
+
+/// What stands in for what is not opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Far {
+    Paper,
+    /// Known to the grammar, not to this version.
+    Directional,
+}
+
+impl Far {
+    /// Reads `paper` or `directional`.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        match text {
+            "paper" => Ok(Self::Paper),
+            "directional" => Ok(Self::Directional),
+            _ => Err("expected `paper`".into()),
+        }
+    }
+
+    /// The far field, if this version has it.
+    pub fn check(self) -> Result<FarField> {
+        match self {
+            Self::Paper => Ok(FarField::Paper),
+            Self::Directional => Err(Error::unsupported("the far field `directional` is not supported yet")
+                .hint("use `--farfield paper`, or leave it out")),
+        }
+    }
+}
+
+/// Reads a level of detail; a wrong one is wrong usage.
+fn parse_lod(text: &str) -> Result<Lod, String> {
+    Lod::parse(text).map_err(|error| match error.hint_text() {
+        Some(hint) => format!("{error}, {hint}"),
+        None => error.to_string(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Catches a device of the design that is taken for a typing error, and one that is ignored.
+    #[test]
+    fn devices_of_later_versions_are_refused_by_name() {
+        assert!(Device::parse("auto").unwrap().check().is_ok());
+        assert!(Device::parse("gpu:x").is_err());
+        for name in ["gpu", "gpu:1", "software", "all"] {
+            let error = Device::parse(name).unwrap().check().unwrap_err();
+            assert_eq!(error.kind(), ErrorKind::Unsupported);
+            assert!(error.message().contains(name));
+        }
+    }
+}
