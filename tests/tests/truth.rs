@@ -59,6 +59,25 @@ fn an_oblique_plane_hides_next_to_nothing() {
     assert!(mean > 1.772_454 * 0.999, "{mean}");
 }
 
+/// Catches rays that see beyond their maximal distance, at faces and at what stands in for them.
+#[test]
+fn nothing_is_seen_beyond_the_maximal_distance() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut scene = MemoryStream::new();
+    scene.push_sphere(DVec3::ZERO, 2.0, 96, 1.0);
+    let map = map_of(&mut scene, folder.path());
+    for lod in [Lod::Off, Lod::Paper, Lod::Footprint { quality: 1.0 }] {
+        for (distance, expected) in [(1.9, TAU * Y00), (2.05, 0.0)] {
+            let shader = ShOcclusion { max_distance: Some(distance), ..ShOcclusion::default() };
+            let v =
+                &trace(&map, &[(DVec3::ZERO, Vec3::Z)], &shader, None, Setup { lod, ..Setup::default() })[0];
+            // Far fields of the paper leak through a wall
+            let tolerance = if lod == Lod::Off || distance < 2.0 { 1e-5 } else { 0.6 * TAU * Y00 };
+            assert_near(v[0], expected, tolerance, &format!("{lod}, rays of {distance}"));
+        }
+    }
+}
+
 /// Catches wrong occlusion by a surface and by a point: a sphere straight above leaves a known cap out.
 #[test]
 fn a_sphere_above_a_point_hides_its_cap() {

@@ -12,7 +12,7 @@ use super::bundle::{Bundle, EXTINCTION_OPAQUE, RAYS_MAX};
 use super::intersect;
 use super::lanes::{Boxes, Corners, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
 use super::leaf::{self, Layout};
-use super::node::{Child, FAR_BYTES, Node, WIDTH};
+use super::node::{Child, FAR_BYTES, LOCATION_BITS, Node, WIDTH};
 
 /// Where a brick is, for the current batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -194,6 +194,9 @@ unsafe fn walk_avx512(
     unsafe { Walk::<super::lanes::avx512::Avx512, _>::run(bricks, start, rays, open2, bundle, scratch) }
 }
 
+/// The location's bits of a stored child.
+const LOCATION_MASK: u16 = (1 << LOCATION_BITS) - 1;
+
 /// A walk under way.
 struct Walk<'a, L: Lanes, B: Bricks> {
     bricks: &'a B,
@@ -270,38 +273,36 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         // Decode the boxes, and see what is to be opened
         // SAFETY: as the caller's
         unsafe { L::boxes(node, self.bundle.reference, &self.bundle.bounds, boxes) };
-        let mut targets = [Target::FarField; WIDTH];
         let mut far_mask = 0_u8;
+        let mut beyond = (0xff_u32 << node.count) as u8;
+        let reach2 = self.bundle.reach * self.bundle.reach;
         for slot in 0..usize::from(node.count) {
-            let target = if boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot] {
-                Target::FarField
-            } else {
-                Self::target(self.bricks, self.memory, entry.address, node.child(slot))
-            };
-            if target == Target::FarField {
-                far_mask |= 1 << slot;
-            } else {
-                if let Target::Open { address, .. } = target {
-                    prefetch(self.memory, address);
-                }
+            far_mask |= u8::from(boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot]) << slot;
+            beyond |= u8::from(boxes.distance2[slot] > reach2) << slot;
+            // A node or leaf that will be visited is asked for before the rays are tested
+            let child = node.children[slot];
+            if child >> LOCATION_BITS < 2 {
+                prefetch(self.memory, entry.address + u32::from(child & LOCATION_MASK));
             }
-            targets[slot] = target;
         }
 
         // Test the rays
         // SAFETY: ray numbers in lists are below the bundle's length; `masks` has the slack
-        let any = unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) };
-        if any & far_mask != 0 {
-            self.meet_far_fields(&node.far, far_mask, count);
-        }
+        let met = unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) } & !beyond;
 
-        // Open the children, far ones first, so that near ones are visited first
+        // Order the children to open, far ones first, so that near ones are visited first
         let mut order = [0_u64; WIDTH];
+        let mut targets = [Target::FarField; WIDTH];
         let mut opened = 0;
-        let mut open_mask = any & !far_mask & (0xff_u32 >> (8 - u32::from(node.count))) as u8;
-        while open_mask != 0 {
-            let slot = open_mask.trailing_zeros() as usize;
-            open_mask &= open_mask - 1;
+        let mut rest = met & !far_mask;
+        while rest != 0 {
+            let slot = rest.trailing_zeros() as usize;
+            rest &= rest - 1;
+            targets[slot] = Self::target(self.bricks, self.memory, entry.address, node.child(slot));
+            if targets[slot] == Target::FarField {
+                far_mask |= 1 << slot;
+                continue;
+            }
             // Squared distances are not negative: their bits are in their order
             let key = u64::from(self.scratch.boxes.distance2[slot].to_bits()) << 8 | slot as u64;
             let mut at = opened;
@@ -311,6 +312,9 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             }
             order[at] = key;
             opened += 1;
+        }
+        if met & far_mask != 0 {
+            self.meet_far_fields(&node.far, met & far_mask, count);
         }
         let mut first = entry.first as usize;
         for &key in &order[..opened] {
@@ -326,6 +330,9 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             }
             match targets[slot] {
                 Target::Open { address, is_leaf } => {
+                    if !is_leaf {
+                        prefetch(self.memory, address);
+                    }
                     stack.push(Entry { address, is_leaf, count: met as u16, first: first as u32 });
                     first += met;
                 }
