@@ -289,10 +289,10 @@ fn the_same_bits_however_it_is_traced() {
     let mut scene = MemoryStream::new();
     for i in 0..60 {
         let center = DVec3::new(f64::from(i % 8), f64::from(i / 8), f64::from(i % 5) * 0.3);
-        scene.push_sphere(center, 0.45, 48, if i % 3 == 0 { 0.6 } else { 1.0 });
+        scene.push_sphere(center, 0.45, 80, if i % 3 == 0 { 0.6 } else { 1.0 });
     }
     let map = map_of(&mut scene, folder.path());
-    let points: Vec<_> = vertices(&scene, Vec3::Z).into_iter().step_by(389).collect();
+    let points: Vec<_> = vertices(&scene, Vec3::Z).into_iter().step_by(1009).collect();
     for lod in [Lod::Off, Lod::Paper, Lod::Footprint { quality: 1.0 }] {
         let of =
             |setup: Setup| trace(&map, &points, &ShOcclusion::default(), Some(0), Setup { lod, ..setup });

@@ -41,7 +41,7 @@ impl Lattice {
         }
         let center = if bounds.is_empty() { DVec3::ZERO } else { bounds.center() };
         let scaled = center * exp2(-exponent);
-        if !(scaled.abs().max_element() < 1e18) {
+        if scaled.is_nan() || scaled.abs().max_element() >= 1e18 {
             return Err(Error::new(
                 ErrorKind::Limit,
                 format!("geometry at {center} is too far from the origin for its detail"),

@@ -183,7 +183,7 @@ impl Layout {
     /// Whether a tile's faces and vertices are rows of its columns.
     fn is_whole_tile(&self) -> bool {
         (1..=FACES_MAX).contains(&self.columns)
-            && self.faces % self.columns == 0
+            && self.faces.is_multiple_of(self.columns)
             && self.vertices == (self.columns + 1) * (self.faces / self.columns + 1)
     }
 

@@ -122,7 +122,7 @@ impl MapWriter {
             if self.offset % SEGMENT_BYTES + length as u64 > SEGMENT_BYTES {
                 self.offset = self.offset.next_multiple_of(SEGMENT_BYTES);
             }
-            if self.offset % SEGMENT_BYTES == 0 {
+            if self.offset.is_multiple_of(SEGMENT_BYTES) {
                 self.finish_segment()?;
                 let path = self.temporary.join(segment_name(self.offset / SEGMENT_BYTES));
                 let file = File::create(&path).map_err(|e| Error::io("create", &path, e))?;

@@ -286,7 +286,7 @@ fn count(
             edges[bin.clamp(0, 127) as usize] += grid.face_count() as u64;
             census.cells.add(middle(&grid), grid.face_count() as u64);
             census.grids += 1;
-            if census.grids % 1024 == 0 {
+            if census.grids.is_multiple_of(1024) {
                 progress("count", (number as f64 + stream.progress()) / streams);
                 check(cancel)?;
             }
@@ -359,7 +359,7 @@ fn fill(
             };
             spill.push(partition, &quantised)?;
             grids += 1;
-            if grids % 1024 == 0 {
+            if grids.is_multiple_of(1024) {
                 progress("fill", (number as f64 + stream.progress()) / streams);
                 check(cancel)?;
             }

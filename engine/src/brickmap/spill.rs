@@ -68,7 +68,7 @@ impl Quantised {
         let wide = usize::from(self.indices[1].max(self.indices[3]));
         let columns = wide.wrapping_sub(1);
         if !(1..=254).contains(&columns)
-            || faces % columns != 0
+            || !faces.is_multiple_of(columns)
             || self.vertices.len() != (faces / columns + 1) * wide
         {
             return;
