@@ -11,7 +11,7 @@ use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble};
 
 /// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
 /// larger ones load what a batch does not touch.
-const TREELET_BYTES: usize = 6 << 10;
+const TREELET_BYTES: usize = 12 << 10;
 
 /// What a primitive of the tree is.
 #[derive(Clone, Copy, Debug)]
