@@ -8,7 +8,7 @@ use std::time::Instant;
 use clap::Args;
 use engine::bake::folder::write_atomically;
 use engine::bake::{Control, bake};
-use engine::relight::{Environment, RelightOptions, Sky, Viewpoint, Visible, visible_faces};
+use engine::relight::{Environment, RelightOptions, Viewpoint, Visible, visible_faces};
 use engine::scene::{self, Camera, Procedural, ProceduralKind, UpAxis};
 use engine::stats::Report;
 use engine::stream::file::{MgsReader, StreamCounts};
@@ -36,6 +36,9 @@ pub struct Arguments {
     /// Another seed grows another jungle
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
+    /// Pixels of the pictures; each shows another bit of the jungle that must be baked
+    #[arg(long, value_name = "WxH", default_value = "960x540", value_parser = values::resolution)]
+    size: [u32; 2],
     /// Bake at least so many points, if the jungle has them: where too few are seen, the camera looks closer
     #[arg(long, value_name = "N", default_value = "300000", value_parser = values::count)]
     points: u64,
@@ -43,8 +46,8 @@ pub struct Arguments {
     resources: Resources,
 }
 
-/// Pixels of the pictures. Each shows a face or two that must be baked: a larger picture takes longer.
-const RESOLUTION: [u32; 2] = [960, 540];
+/// The pictures' skies and how many stops each is brightened by: it is dark under trees.
+const LIGHTS: [(&str, f32); 3] = [("sky", 2.0), ("overcast", 0.8), ("sunset", 1.2)];
 
 /// The jungle is in metres.
 const METERS_PER_UNIT: f64 = 1.0;
@@ -77,7 +80,8 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
         micropolygons: arguments.micropolygons,
     };
     let (world_from_camera, fov_degrees) = demo_camera(&jungle, METERS_PER_UNIT, UP)?;
-    let camera = Camera { name: "clearing".into(), fov_degrees, resolution: RESOLUTION, world_from_camera };
+    let camera =
+        Camera { name: "clearing".into(), fov_degrees, resolution: arguments.size, world_from_camera };
 
     let (seen, supersampling) =
         write_seen(&jungle, &camera, arguments.points, &out.join("seen.mgs"), control)?;
@@ -91,7 +95,7 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
     let stream = baked.join("seen.mgs");
     let pictures = light(&stream, &camera, supersampling, out, control)?;
     let made = Made { scene: scene_path, stream, pictures, report, seconds: start.elapsed().as_secs_f64() };
-    Answer::new(&made, made.describe(&seen))
+    Answer::new(&made, made.describe(&seen, supersampling))
 }
 
 /// Writes the faces that the camera sees as a stream of their own. Returns what they count, and how many samples per
@@ -159,14 +163,15 @@ fn light(
     out: &Path,
     control: Control<'_>,
 ) -> Result<Vec<PathBuf>> {
-    let mut pictures = Vec::with_capacity(Sky::ALL.len());
-    for (name, sky) in Sky::ALL {
+    let mut pictures = Vec::with_capacity(LIGHTS.len());
+    for (sky, stops) in LIGHTS {
         let reader = MgsReader::open(stream)?;
-        let mut options = RelightOptions::new(Environment::sky(sky, None)?);
+        let mut options = RelightOptions::new(Environment::open(sky)?);
         options.viewpoint = Viewpoint::Camera(camera.clone());
         options.supersampling = supersampling;
+        options.exposure_stops = stops;
         learn_how_it_was_baked(&reader, &mut options)?;
-        let picture = out.join(format!("{name}.png"));
+        let picture = out.join(format!("{sky}.png"));
         draw(reader, &options, &picture, control)?;
         pictures.push(picture);
     }
@@ -174,7 +179,7 @@ fn light(
 }
 
 impl Made {
-    fn describe(&self, seen: &StreamCounts) -> String {
+    fn describe(&self, seen: &StreamCounts, supersampling: u32) -> String {
         let mut text = format!(
             "The camera sees {} faces of {} micropolygons; their {} vertices were baked.\n\n{}\n\n",
             figures::count(seen.micropolygons),
@@ -187,7 +192,7 @@ impl Made {
         let (scene, stream) = (self.scene.display(), self.stream.display());
         text.push_str(&format!("\nThe scene is {scene}, the baked stream {stream}. Try another light:\n"));
         text.push_str(&format!(
-            "  pantaray relight {stream} -o sky.png --env overcast --camera clearing --scene {scene}\n"
+            "  pantaray relight {stream} -o mine.png --env MAP.hdr --camera clearing --scene {scene} --supersampling {supersampling}\n"
         ));
         text
     }

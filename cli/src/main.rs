@@ -31,12 +31,15 @@ struct Arguments {
     #[command(subcommand)]
     command: Command,
     /// Print one JSON object on standard output, and nothing else there
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = EVERYWHERE)]
     json: bool,
     /// Show no progress
-    #[arg(long, short, global = true)]
+    #[arg(long, short, global = true, help_heading = EVERYWHERE)]
     quiet: bool,
 }
+
+/// Heads the options that every subcommand has.
+const EVERYWHERE: &str = "With every command";
 
 const AFTER_HELP: &str = "\
 Exit codes: 0 done, 1 the work failed, 2 wrong usage.
@@ -82,9 +85,41 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
 mod tests {
     use clap::CommandFactory;
 
+    const DOCUMENTATION: &str = include_str!("../../docs/command-line.md");
+    const REPORT: &str = include_str!("../../docs/report.md");
+
     /// Catches arguments that contradict each other, which clap reports only when it runs.
     #[test]
     fn the_grammar_is_sound() {
         super::Arguments::command().debug_assert();
+    }
+
+    /// Catches a command or an option that the documentation does not know.
+    #[test]
+    fn every_option_is_documented() {
+        let grammar = super::Arguments::command();
+        for command in grammar.get_subcommands() {
+            let heading = format!("\n## {}\n", command.get_name());
+            let section =
+                DOCUMENTATION.split(&heading).nth(1).unwrap_or_else(|| panic!("no section{heading}"));
+            let section = section.split("\n## ").next().expect("text");
+            for option in command.get_opts().filter(|option| !option.is_hide_set()) {
+                let name = format!("--{}", option.get_long().expect("a long name"));
+                assert!(section.contains(&name), "{name} of {}", command.get_name());
+            }
+        }
+    }
+
+    /// Catches a figure of the report that the documentation does not know.
+    #[test]
+    fn every_figure_is_documented() {
+        let report = engine::stats::Report { bake_sets: vec![Default::default()], ..Default::default() };
+        let value = serde_json::to_value(report).expect("a report");
+        let parts = [&value, &value["brickmap"], &value["bake"], &value["bake_sets"][0]];
+        for part in parts {
+            for figure in part.as_object().expect("an object").keys() {
+                assert!(REPORT.contains(&format!("`{figure}`")), "{figure}");
+            }
+        }
     }
 }

@@ -28,12 +28,12 @@ pub struct Arguments {
     /// The light: `sky`, `overcast`, `sunset`, or a latitude-longitude map, .hdr or .exr
     #[arg(long, value_name = "SKY|FILE", default_value = "sky")]
     env: String,
-    /// Turns the light about the up axis, degrees, counter-clockwise seen from above
+    /// Turn the light about the up axis, degrees, counter-clockwise seen from above
     #[arg(long, value_name = "DEGREES", default_value_t = 0.0, allow_negative_numbers = true)]
     rotate: f64,
     #[command(flatten)]
     view: View,
-    /// Brightens a .png by so many stops
+    /// Brighten a .png by so many stops
     #[arg(long, value_name = "STOPS", default_value_t = 0.0, allow_negative_numbers = true)]
     exposure: f32,
     /// The attribute of visibility coefficients [default: the one named after occlusion]
