@@ -12,7 +12,7 @@ use engine::{Error, ErrorKind, Result, scene};
 use crate::console::{Answer, Console};
 use crate::{figures, values};
 
-/// Bake a scene: DIR/<bake set>.mgs for each bake set, and DIR/report.json
+/// Bake a scene: `DIR/<bake set>.mgs` for each bake set, and DIR/report.json
 ///
 /// Run again after an interruption, the same command continues where it was, and the result is the same bytes.
 #[derive(Debug, Args)]

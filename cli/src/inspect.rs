@@ -7,7 +7,7 @@ use engine::brickmap::{BrickMap, Manifest};
 use engine::output::inspect::{SummaryBounds, inspect_stream};
 use engine::stats::Report;
 use engine::stream::file::{Footer, MgsReader};
-use engine::stream::{Attribute, MicrogridStream, Rate};
+use engine::stream::{Attribute, MicrogridStream};
 use engine::{Error, ErrorKind, Result};
 use serde::Serialize;
 
@@ -80,7 +80,6 @@ impl FastSummary {
             value_type: *value_type,
             components: *components,
         };
-        debug_assert!(reader.schema().attributes.iter().all(|a| matches!(a.rate, Rate::Vertex | Rate::Grid)));
         Ok(Self {
             grids: counts.grids,
             micropolygons: counts.micropolygons,

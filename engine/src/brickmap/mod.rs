@@ -3,7 +3,7 @@
 //! Pass 1 counts micropolygons in a sparse grid of cells ([`bucket`]) and gathers bounds and edge lengths, from which the
 //! lattice follows. Pass 2 snaps every grid to the lattice and spills it to its partition ([`spill`]). Then every
 //! partition on its own: full leaves ([`chunk`]), a tree over them ([`bvh`]), bricks ([`pack`]), written in order; at last
-//! a tree over the partitions. [`file`] is the result on disk, [`farfield`] what stands in for what is not opened.
+//! a tree over the partitions. [`mod@file`] is the result on disk, [`farfield`] what stands in for what is not opened.
 //!
 //! The bytes depend on the occluders and the build parameters alone, not on threads or memory.
 
