@@ -79,7 +79,8 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
     let (world_from_camera, fov_degrees) = demo_camera(&jungle, METERS_PER_UNIT, UP)?;
     let camera = Camera { name: "clearing".into(), fov_degrees, resolution: RESOLUTION, world_from_camera };
 
-    let (seen, supersampling) = write_seen(&jungle, &camera, arguments.points, &out.join("seen.mgs"), control)?;
+    let (seen, supersampling) =
+        write_seen(&jungle, &camera, arguments.points, &out.join("seen.mgs"), control)?;
     let scene_path = out.join("scene.xml");
     write_atomically(&scene_path, scene_xml(&jungle, &camera).as_bytes())?;
 

@@ -133,7 +133,9 @@ fn keep(source: &Microgrid, schema: &Schema, kept: &[FaceId], out: &mut Microgri
     for (count, (vertex, number)) in needed.enumerate() {
         *number = Some(count as u8);
         out.positions.push(source.positions[vertex]);
-        for (attribute, (from, to)) in schema.attributes.iter().zip(source.columns.iter().zip(&mut out.columns)) {
+        for (attribute, (from, to)) in
+            schema.attributes.iter().zip(source.columns.iter().zip(&mut out.columns))
+        {
             if attribute.rate == Rate::Vertex {
                 let bytes = attribute.value_bytes();
                 to.extend_from_slice(&from[vertex * bytes..(vertex + 1) * bytes]);
