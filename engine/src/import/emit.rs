@@ -301,25 +301,6 @@ fn power_of_two(exponent: i16) -> f64 {
     f64::from_bits(((i64::from(exponent) + 1023) as u64) << 52)
 }
 
-/// The radius of points and lines that have none: for points half the spacing that as many would have on a flat
-/// square as wide as the mesh, at most a hundredth of its diagonal; a thousandth of the diagonal for lines; a
-/// millimetre where the diagonal is zero. Returned for the mesh as a whole, by what there is more of.
-pub(super) fn default_radius(mesh: &Mesh, meters_per_unit: f64) -> f32 {
-    let diagonal = mesh.bounds().size().length();
-    let points = mesh.faces.iter().filter(|face| face.arity == 1).count();
-    let lines = mesh.faces.iter().filter(|face| face.arity == 2).count();
-    let share = if lines > points { 0.001 } else { (0.5 / (points.max(1) as f64).sqrt()).min(0.01) };
-    let radius = diagonal * share;
-    if radius > 0.0 { radius as f32 } else { (0.001 / meters_per_unit) as f32 }
-}
-
-/// Warns that points or lines got a radius that nobody gave.
-pub(super) fn warn_radius(mesh: &Mesh, radius: f32, report: &mut ImportReport) {
-    if mesh.radii.is_empty() && mesh.has_radii() {
-        report.warn(format!("points or lines without a radius were given `{radius}`"));
-    }
-}
-
 /// The byte of an opacity in 0 to 1. What covers anything at all stays above zero.
 pub(super) fn opacity_byte(opacity: f32) -> u8 {
     let byte = srgb::unit_byte(opacity);

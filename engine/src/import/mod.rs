@@ -15,6 +15,7 @@ mod mesh;
 mod obj;
 mod ply;
 mod polygon;
+mod radius;
 mod srgb;
 
 #[cfg(test)]

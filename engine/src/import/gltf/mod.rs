@@ -16,8 +16,8 @@ use std::path::Path;
 use self::container::Container;
 use self::document::AlphaMode;
 use self::nodes::Copies;
-use super::emit::{self, Carried, Emitter};
-use super::{GridSink, ImportOptions, ImportReport, cut};
+use super::emit::{Carried, Emitter};
+use super::{GridSink, ImportOptions, ImportReport, cut, radius};
 use crate::Result;
 
 /// Imports a glTF or GLB file.
@@ -37,9 +37,9 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
             let read = primitive::read(&mut container, (mesh, index), &mut images, carried.albedo, &mut own)?;
             add_copies(&mut report, &own, places.len() as u64);
             let Some((mesh, bytes)) = read else { continue };
-            let radius = emit::default_radius(&mesh, 1.0);
-            emit::warn_radius(&mesh, radius, &mut report);
             let clusters = cut::cut(&mesh);
+            let radius = radius::default_radius(&mesh, &clusters, 1.0);
+            radius::warn_radius(&mesh, radius, &mut report);
             for (id, placement) in places {
                 emitter.emit(&mesh, &clusters, placement, (*id, radius), &mut report)?;
             }

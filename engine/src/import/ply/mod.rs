@@ -13,7 +13,7 @@ use self::header::{Element, Property, Scalar};
 use super::budget::Budget;
 use super::emit::{self, Carried, Emitter, Placement};
 use super::mesh::{Face, Mesh};
-use super::{GridSink, ImportOptions, ImportReport, cut, srgb};
+use super::{GridSink, ImportOptions, ImportReport, cut, radius, srgb};
 use crate::{Error, ErrorKind, Result};
 
 /// Corners of a polygon at most.
@@ -27,9 +27,9 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let mut report = ImportReport::default();
     let mut mesh = read(path, options, &mut report)?;
     mesh.finish(&mut report)?;
-    let radius = emit::default_radius(&mesh, options.meters_per_unit);
-    emit::warn_radius(&mesh, radius, &mut report);
     let clusters = cut::cut(&mesh);
+    let radius = radius::default_radius(&mesh, &clusters, options.meters_per_unit);
+    radius::warn_radius(&mesh, radius, &mut report);
     let mut emitter = Emitter::new(sink, Carried::by(&mesh), options)?;
     emitter.emit(&mesh, &clusters, &Placement::HERE, (0, radius), &mut report)?;
     Ok(report)
