@@ -37,7 +37,7 @@ pub struct Arguments {
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
     /// Pixels of the pictures; each shows another bit of the jungle that must be baked
-    #[arg(long, value_name = "WxH", default_value = "960x540", value_parser = values::resolution)]
+    #[arg(long, value_name = "WxH", default_value = "800x450", value_parser = values::resolution)]
     size: [u32; 2],
     /// Bake at least so many points, if the jungle has them: where too few are seen, the camera looks closer
     #[arg(long, value_name = "N", default_value = "300000", value_parser = values::count)]

@@ -145,7 +145,7 @@ fn inspect_map(path: &Path) -> Result<Answer> {
     let bounds = map.bounds();
     let mut text = format!(
         "micropolygons  {}\ngrids          {}\nbricks         {}\nnodes          {}\nleaves         {}\n",
-        manifest.micropolygons, manifest.grids, manifest.bricks, manifest.tree.nodes, manifest.tree.leaves
+        manifest.micropolygons, manifest.grids, manifest.bricks, manifest.nodes, manifest.leaves
     );
     text.push_str(&format!(
         "bytes          {} ({:.2} per micropolygon)\nlattice        2^{} units per step\nbounds         {} to {}\n",

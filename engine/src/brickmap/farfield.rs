@@ -11,11 +11,10 @@ use crate::brick::leaf::{EXTINCTION_PER_OCTAVE, Face, OPAQUE, extinction_from_op
 use crate::brick::node::FAR_BYTES;
 
 /// Which far field a brick map has.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FarField {
     /// The paper's: one opacity per box, from sums of areas.
-    #[default]
     Paper,
 }
 

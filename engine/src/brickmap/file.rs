@@ -1,56 +1,45 @@
-//! Writing a brick map: a folder of immutable objects, byte by byte in `docs/formats-brickmap.md`.
+//! A brick map on disk: a folder of immutable objects.
 //!
 //! ```text
-//! manifest.json    version, lattice, counts, hashes; written last
-//! directory        "PDIR", version u32, bricks u32, 0 u32; then u16 per brick: its length / 64
-//! segment.0000 …   bricks by number, 1 GiB at most each; a brick does not straddle two
+//! manifest.json    version, lattice, counts, build parameters; written last
+//! directory        u64 per brick: offset / 64 in the upper 52 bits, length / 64 - 1 in the lower 12
+//! segment.0000 …   bricks in order, 1 GiB at most each; a brick does not straddle two
 //! ```
 //!
-//! Bricks lie back to back; one that does not fit into the rest of a segment starts the next. So lengths give offsets.
-//! The folder appears under its name when it is complete.
+//! Offsets count through all segments as if each had its full size. The folder appears under its name when it is
+//! complete. Every brick has its own checksum, the directory's is in the manifest.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use glam::{I64Vec3, IVec3};
 use serde::{Deserialize, Serialize};
-use xxhash_rust::xxh3::{Xxh3, xxh3_64};
+use xxhash_rust::xxh3::xxh3_64;
 
 use super::farfield::FarField;
-use super::pack::{ByteSplit, TreeStats};
-use crate::brick::ALIGNMENT;
+use super::pack::ByteSplit;
+use crate::brick::lattice::SHIFT_MAX;
+use crate::brick::{ALIGNMENT, BYTES_MAX, Lattice, LatticeBox};
+use crate::math::Bounds;
 use crate::{Error, ErrorKind, Result};
 
 /// The version of bricks and map. Others are refused.
-pub const FORMAT_VERSION: u32 = 2;
+pub const FORMAT_VERSION: u32 = 1;
 
-/// Bytes of a segment at most.
-pub const SEGMENT_BYTES: u64 = 1 << 30;
-
-/// Bytes before the directory's lengths.
-pub const DIRECTORY_HEADER_BYTES: usize = 16;
-/// How the directory starts.
-pub const DIRECTORY_MAGIC: [u8; 4] = *b"PDIR";
-
-/// The manifest's name.
-pub const MANIFEST: &str = "manifest.json";
-/// The directory's name.
-pub const DIRECTORY: &str = "directory";
+const SEGMENT_BYTES: u64 = 1 << 30;
+const LENGTH_BITS: u32 = 12;
+const _: () = assert!(BYTES_MAX / ALIGNMENT <= 1 << LENGTH_BITS);
 
 /// Bricks of a map at most: their numbers have 32 bits and some are set aside.
-pub const BRICKS_MAX: u64 = 0xffff_0000;
+const BRICKS_MAX: u64 = 0xffff_0000;
 
 /// What `manifest.json` says.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// [`FORMAT_VERSION`].
     pub version: u32,
-    /// xxh3 of this file with zeros in this place, hexadecimal.
-    pub manifest_hash: String,
-    /// xxh3 of the directory, hexadecimal.
-    pub directory_hash: String,
-    /// xxh3-128 of the occluder streams, hexadecimal: what [`super::hash_occluders`] returns.
-    pub stream_hash: String,
     /// The lattice's step is `2^exponent` scene units.
     pub lattice_exponent: i32,
     /// The lattice's origin in steps.
@@ -65,10 +54,8 @@ pub struct Manifest {
     pub bricks: u32,
     /// Bytes of all bricks.
     pub bytes: u64,
-    /// Bytes of a segment at most.
-    pub segment_bytes: u64,
-    /// The segments.
-    pub segments: Vec<Segment>,
+    /// xxh3 of the directory, hexadecimal.
+    pub directory_hash: String,
     /// Micropolygons in the map.
     pub micropolygons: u64,
     /// Microgrids that they came in.
@@ -77,50 +64,31 @@ pub struct Manifest {
     pub far_field: FarField,
     /// Where the bytes go.
     pub split: ByteSplit,
-    /// The tree's counts and areas.
-    pub tree: TreeStats,
-}
-
-/// One of a map's segments.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Segment {
-    /// Its bytes.
-    pub bytes: u64,
-    /// Their xxh3, hexadecimal.
-    pub hash: String,
-}
-
-/// A segment that is being written.
-struct OpenSegment {
-    file: BufWriter<File>,
-    bytes: u64,
-    hash: Xxh3,
+    /// Leaves, and nodes: with the counts above, how full they are.
+    pub leaves: u64,
+    /// Nodes.
+    pub nodes: u64,
 }
 
 /// Writes a brick map.
+#[derive(Debug)]
 pub struct MapWriter {
     target: PathBuf,
     temporary: PathBuf,
-    segment_bytes: u64,
-    segment: Option<OpenSegment>,
-    segments: Vec<Segment>,
-    /// In units of [`ALIGNMENT`].
-    lengths: Vec<u16>,
-    bytes: u64,
+    segment: Option<std::io::BufWriter<File>>,
+    offset: u64,
+    directory: Vec<u8>,
     done: bool,
 }
 
 impl MapWriter {
-    /// Starts a map that will appear at `target`, with segments of at most `segment_bytes`.
+    /// Starts a map that will appear at `target`.
     ///
     /// # Errors
-    /// When the folder cannot be made, or `target` is something else than a brick map or an empty folder.
-    pub fn create(target: &Path, segment_bytes: u64) -> Result<Self> {
-        let Some(name) = target.file_name() else {
-            return Err(Error::invalid("a brick map needs a folder with a name").at(target));
-        };
-        check_replaceable(target)?;
-        let temporary = sibling(target, name, "tmp");
+    /// When the folder cannot be made.
+    pub fn create(target: &Path) -> Result<Self> {
+        let name = target.file_name().unwrap_or_default().to_string_lossy();
+        let temporary = target.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
         if temporary.exists() {
             std::fs::remove_dir_all(&temporary).map_err(|e| Error::io("remove", &temporary, e))?;
         }
@@ -128,102 +96,78 @@ impl MapWriter {
         Ok(Self {
             target: target.to_path_buf(),
             temporary,
-            segment_bytes,
             segment: None,
-            segments: Vec::new(),
-            lengths: Vec::new(),
-            bytes: 0,
+            offset: 0,
+            directory: Vec::new(),
             done: false,
         })
     }
 
     /// Bricks written so far.
     pub fn bricks(&self) -> u32 {
-        self.lengths.len() as u32
+        (self.directory.len() / 8) as u32
     }
 
     /// Writes bricks that lie one after the other in `bytes`.
     ///
     /// # Errors
     /// When the disk is full or fails, or there are too many bricks.
-    pub fn write(&mut self, mut bytes: &[u8], lengths: &[u32]) -> Result<()> {
-        if (self.lengths.len() + lengths.len()) as u64 > BRICKS_MAX {
+    pub fn write(&mut self, bytes: &[u8], lengths: &[u32]) -> Result<()> {
+        if (self.directory.len() / 8 + lengths.len()) as u64 > BRICKS_MAX {
             return Err(Error::new(ErrorKind::Limit, format!("more than {BRICKS_MAX} bricks")));
         }
+        let mut at = 0;
         for &length in lengths {
-            let (brick, rest) = bytes.split_at(length as usize);
-            bytes = rest;
-            if self.segment.as_ref().is_none_or(|s| s.bytes + u64::from(length) > self.segment_bytes) {
-                self.next_segment()?;
+            let length = length as usize;
+            if self.offset % SEGMENT_BYTES + length as u64 > SEGMENT_BYTES {
+                self.offset = self.offset.next_multiple_of(SEGMENT_BYTES);
             }
+            if self.offset.is_multiple_of(SEGMENT_BYTES) {
+                self.finish_segment()?;
+                let path = self.temporary.join(segment_name(self.offset / SEGMENT_BYTES));
+                let file = File::create(&path).map_err(|e| Error::io("create", &path, e))?;
+                self.segment = Some(std::io::BufWriter::with_capacity(1 << 20, file));
+            }
+            let entry = ((self.offset / ALIGNMENT as u64) << LENGTH_BITS) | (length / ALIGNMENT - 1) as u64;
+            self.directory.extend_from_slice(&entry.to_le_bytes());
             let segment = self.segment.as_mut().expect("opened above");
-            segment.file.write_all(brick).map_err(|e| io("write", &self.target, e))?;
-            segment.hash.update(brick);
-            segment.bytes += u64::from(length);
-            self.bytes += u64::from(length);
-            self.lengths.push((length as usize / ALIGNMENT) as u16);
+            segment.write_all(&bytes[at..at + length]).map_err(|e| Error::io("write", &self.target, e))?;
+            self.offset += length as u64;
+            at += length;
         }
-        Ok(())
-    }
-
-    fn next_segment(&mut self) -> Result<()> {
-        self.finish_segment()?;
-        let path = self.temporary.join(segment_name(self.segments.len() as u64));
-        let file = File::create(&path).map_err(|e| io("create", &path, e))?;
-        let file = BufWriter::with_capacity(1 << 20, file);
-        self.segment = Some(OpenSegment { file, bytes: 0, hash: Xxh3::new() });
         Ok(())
     }
 
     fn finish_segment(&mut self) -> Result<()> {
-        let Some(OpenSegment { file, bytes, hash }) = self.segment.take() else { return Ok(()) };
-        let sync = || file.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all();
-        sync().map_err(|e| io("write", &self.target, e))?;
-        self.segments.push(Segment { bytes, hash: format!("{:016x}", hash.digest()) });
-        Ok(())
+        let Some(segment) = self.segment.take() else { return Ok(()) };
+        let sync = || segment.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all();
+        sync().map_err(|e| Error::io("write", &self.target, e))
     }
 
-    /// Writes directory and manifest, and gives the map its name. Bricks, bytes, segments, hashes and `split.directory`
-    /// are filled in.
+    /// Writes directory and manifest, and gives the map its name. `directory_hash` and `split.directory` are filled in.
     ///
     /// # Errors
     /// When the disk is full or fails.
     pub fn finish(mut self, mut manifest: Manifest) -> Result<Manifest> {
         self.finish_segment()?;
-        let mut directory = DIRECTORY_MAGIC.to_vec();
-        for word in [FORMAT_VERSION, self.bricks(), 0] {
-            directory.extend_from_slice(&word.to_le_bytes());
-        }
-        self.lengths.iter().for_each(|length| directory.extend_from_slice(&length.to_le_bytes()));
-        manifest.bricks = self.bricks();
-        manifest.bytes = self.bytes;
-        manifest.segments = std::mem::take(&mut self.segments);
-        manifest.directory_hash = format!("{:016x}", xxh3_64(&directory));
-        manifest.split.directory = directory.len() as u64;
-        let json = sealed(&mut manifest)?;
+        manifest.directory_hash = format!("{:016x}", xxh3_64(&self.directory));
+        manifest.split.directory = self.directory.len() as u64;
         let write = |name: &str, bytes: &[u8]| {
-            let mut file = File::create(self.temporary.join(name))?;
+            let path = self.temporary.join(name);
+            let mut file = File::create(&path)?;
             file.write_all(bytes)?;
             file.sync_all()
         };
+        let json = serde_json::to_vec_pretty(&manifest).map_err(|e| Error::invalid(e.to_string()))?;
         let publish = || {
-            write(DIRECTORY, &directory)?;
-            write(MANIFEST, &json)?;
-            sync_folder(&self.temporary)?;
-            // What is there makes way, and goes when the new map is in its place
-            let old = sibling(&self.target, self.target.file_name().unwrap_or_default(), "old");
-            let replaces = self.target.exists();
-            if replaces {
-                std::fs::rename(&self.target, &old)?;
+            write("directory", &self.directory)?;
+            write("manifest.json", &json)?;
+            if self.target.exists() {
+                std::fs::remove_dir_all(&self.target)?;
             }
-            std::fs::rename(&self.temporary, &self.target)?;
-            if replaces {
-                std::fs::remove_dir_all(&old)?;
-            }
-            sync_folder(self.target.parent().unwrap_or(Path::new(".")))
+            std::fs::rename(&self.temporary, &self.target)
         };
-        check_replaceable(&self.target)?;
-        publish().map_err(|e| io("write", &self.target, e))?;
+        publish().map_err(|e| Error::io("write", &self.target, e))?;
         self.done = true;
         Ok(manifest)
     }
@@ -238,74 +182,212 @@ impl Drop for MapWriter {
     }
 }
 
-impl std::fmt::Debug for MapWriter {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("MapWriter")
-            .field("target", &self.target)
-            .field("bytes", &self.bytes)
-            .finish_non_exhaustive()
-    }
-}
-
-/// The name of a segment.
-pub fn segment_name(number: u64) -> String {
+fn segment_name(number: u64) -> String {
     format!("segment.{number:04}")
 }
 
-/// A name beside `target` that no other process uses.
-fn sibling(target: &Path, name: &std::ffi::OsStr, what: &str) -> PathBuf {
-    target.with_file_name(format!(".{}.{}.{what}", name.to_string_lossy(), std::process::id()))
+/// An open brick map.
+#[derive(Debug)]
+pub struct BrickMap {
+    path: PathBuf,
+    manifest: Manifest,
+    directory: Vec<u64>,
+    segments: Vec<File>,
 }
 
-/// Nothing but a brick map or an empty folder may be replaced by a brick map.
-fn check_replaceable(target: &Path) -> Result<()> {
-    let entries = match std::fs::read_dir(target) {
-        Ok(mut entries) => entries.next().is_some(),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
-        Err(error) => return Err(Error::io("replace", target, error)),
-    };
-    if entries && !target.join(MANIFEST).exists() {
-        return Err(Error::invalid("the folder holds something else than a brick map")
-            .at(target)
-            .hint("give another folder, or empty this one"));
+impl BrickMap {
+    /// Opens the map in a folder.
+    ///
+    /// # Errors
+    /// When it is not there, of another version, or damaged.
+    pub fn open(path: &Path) -> Result<Self> {
+        let manifest = read_manifest(&path.join("manifest.json"))?;
+        let directory_path = path.join("directory");
+        let expected = 8 * u64::from(manifest.bricks);
+        let found =
+            std::fs::metadata(&directory_path).map_err(|e| Error::io("read", &directory_path, e))?.len();
+        if found != expected || manifest.bricks == 0 {
+            return Err(Error::corrupt(
+                &directory_path,
+                found.min(expected),
+                format!("{found} bytes, {expected} expected"),
+            )
+            .hint("build the brick map again"));
+        }
+        let bytes = std::fs::read(&directory_path).map_err(|e| Error::io("read", &directory_path, e))?;
+        if format!("{:016x}", xxh3_64(&bytes)) != manifest.directory_hash {
+            return Err(Error::corrupt(&directory_path, 0, "checksum does not match")
+                .hint("build the brick map again"));
+        }
+        let directory: Vec<u64> = bytes
+            .chunks_exact(8)
+            .map(|entry| u64::from_le_bytes(entry.try_into().expect("8 bytes")))
+            .collect();
+        let mut map = Self { path: path.to_path_buf(), manifest, directory, segments: Vec::new() };
+        map.open_segments()?;
+        Ok(map)
     }
-    Ok(())
+
+    /// Opens the segments and checks that bricks lie in them in order.
+    fn open_segments(&mut self) -> Result<()> {
+        let mut end = 0;
+        for (brick, &entry) in self.directory.iter().enumerate() {
+            let (offset, length) = place(entry);
+            let straddles = offset / SEGMENT_BYTES != (offset + length - 1) / SEGMENT_BYTES;
+            if offset < end || straddles || offset / SEGMENT_BYTES > end / SEGMENT_BYTES + 1 {
+                return Err(Error::corrupt(
+                    self.path.join("directory"),
+                    8 * brick as u64,
+                    "impossible entry",
+                ));
+            }
+            end = offset + length;
+        }
+        for number in 0..end.div_ceil(SEGMENT_BYTES) {
+            let path = self.path.join(segment_name(number));
+            let file = File::open(&path).map_err(|e| Error::io("open", &path, e))?;
+            let found = file.metadata().map_err(|e| Error::io("read", &path, e))?.len();
+            let last =
+                self.directory.partition_point(|&entry| place(entry).0 < (number + 1) * SEGMENT_BYTES) - 1;
+            let (offset, length) = place(self.directory[last]);
+            let expected = offset + length - number * SEGMENT_BYTES;
+            if found != expected {
+                return Err(Error::corrupt(
+                    &path,
+                    found.min(expected),
+                    format!("{found} bytes, {expected} expected"),
+                )
+                .hint("build the brick map again"));
+            }
+            self.segments.push(file);
+        }
+        Ok(())
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What the manifest says.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// The lattice that all vertices lie on.
+    pub fn lattice(&self) -> Lattice {
+        Lattice {
+            exponent: self.manifest.lattice_exponent,
+            origin: I64Vec3::from_array(self.manifest.lattice_origin),
+        }
+    }
+
+    /// The lattice shift of an occluder stream: its vertices are multiples of `2^shift` steps.
+    pub fn shift(&self, stream: usize) -> u8 {
+        self.manifest.shifts.get(stream).copied().unwrap_or(0)
+    }
+
+    /// Bricks.
+    pub fn brick_count(&self) -> u32 {
+        self.manifest.bricks
+    }
+
+    /// The root brick's number.
+    pub fn root(&self) -> u32 {
+        self.manifest.bricks - 1
+    }
+
+    /// The box of everything on the lattice.
+    pub fn root_box(&self) -> LatticeBox {
+        LatticeBox { min: IVec3::from_array(self.manifest.low), max: IVec3::from_array(self.manifest.high) }
+    }
+
+    /// The box of everything in scene units.
+    pub fn bounds(&self) -> Bounds {
+        let (lattice, all) = (self.lattice(), self.root_box());
+        Bounds { min: lattice.position(all.min), max: lattice.position(all.max) }
+    }
+
+    /// Bytes of all bricks.
+    pub fn bytes(&self) -> u64 {
+        self.manifest.bytes
+    }
+
+    /// Bytes of a brick.
+    pub fn brick_bytes(&self, brick: u32) -> u32 {
+        place(self.directory[brick as usize]).1 as u32
+    }
+
+    /// Reads `count` bricks from `first` on into `out`, one after the other; their lengths add up to its length.
+    ///
+    /// # Errors
+    /// When storage fails.
+    pub fn read(&self, first: u32, count: u32, out: &mut [u8]) -> Result<()> {
+        let mut at = 0;
+        let mut brick = first as usize;
+        let end = first as usize + count as usize;
+        while brick < end {
+            // One read for all that lie in one segment
+            let (offset, _) = place(self.directory[brick]);
+            let segment = offset / SEGMENT_BYTES;
+            let mut bytes = 0;
+            while brick < end && place(self.directory[brick]).0 / SEGMENT_BYTES == segment {
+                bytes += place(self.directory[brick]).1 as usize;
+                brick += 1;
+            }
+            self.segments[segment as usize]
+                .read_exact_at(&mut out[at..at + bytes], offset % SEGMENT_BYTES)
+                .map_err(|e| Error::io("read", self.path.join(segment_name(segment)), e))?;
+            at += bytes;
+        }
+        Ok(())
+    }
 }
 
-fn sync_folder(folder: &Path) -> std::io::Result<()> {
-    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-    File::open(folder)?.sync_all()
+/// Offset and length in bytes of a directory entry.
+fn place(entry: u64) -> (u64, u64) {
+    let length = (entry & ((1 << LENGTH_BITS) - 1)) + 1;
+    ((entry >> LENGTH_BITS) * ALIGNMENT as u64, length * ALIGNMENT as u64)
 }
 
-fn io(what: &str, path: &Path, error: std::io::Error) -> Error {
-    let full = error.kind() == std::io::ErrorKind::StorageFull;
-    let error = Error::io(what, path, error);
-    if full { error.hint("a brick map needs about 20 bytes for every micropolygon") } else { error }
-}
-
-const HASH_KEY: &str = "\"manifest_hash\": \"";
-
-/// The manifest's text with its own hash in it.
-fn sealed(manifest: &mut Manifest) -> Result<Vec<u8>> {
-    manifest.manifest_hash = "0".repeat(16);
-    let mut json = serde_json::to_vec_pretty(&manifest).map_err(|e| Error::invalid(e.to_string()))?;
-    json.push(b'\n');
-    let hash = format!("{:016x}", xxh3_64(&json));
-    let at = hash_place(&json).expect("the key was written above");
-    json[at..at + 16].copy_from_slice(hash.as_bytes());
-    manifest.manifest_hash = hash;
-    Ok(json)
-}
-
-/// Whether the text's hash is that of the text.
-pub fn is_sealed(json: &[u8]) -> bool {
-    let Some(at) = hash_place(json) else { return false };
-    let mut zeroed = json.to_vec();
-    zeroed[at..at + 16].fill(b'0');
-    json[at..at + 16] == *format!("{:016x}", xxh3_64(&zeroed)).as_bytes()
-}
-
-fn hash_place(json: &[u8]) -> Option<usize> {
-    let at = json.windows(HASH_KEY.len()).position(|window| window == HASH_KEY.as_bytes())? + HASH_KEY.len();
-    (json.len() >= at + 16).then_some(at)
+/// Reads and checks a manifest.
+fn read_manifest(path: &Path) -> Result<Manifest> {
+    let found = std::fs::metadata(path).map_err(|e| Error::io("read", path, e))?.len();
+    if found > 1 << 20 {
+        return Err(Error::corrupt(path, 0, "a manifest of over a mebibyte"));
+    }
+    let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+    let text = |e: serde_json::Error| {
+        Error::new(ErrorKind::Corrupt, format!("broken manifest: {e}")).at_text(
+            path,
+            e.line() as u64,
+            e.column() as u64,
+        )
+    };
+    let value: serde_json::Value = serde_json::from_slice(&bytes).map_err(text)?;
+    let version = value.get("version").and_then(serde_json::Value::as_u64);
+    if version != Some(u64::from(FORMAT_VERSION)) {
+        let version = version.map_or("none".into(), |version| version.to_string());
+        return Err(Error::unsupported(format!(
+            "brick map of version {version}, version {FORMAT_VERSION} wanted"
+        ))
+        .at(path)
+        .hint("build the brick map again"));
+    }
+    let manifest: Manifest = serde_json::from_value(value).map_err(text)?;
+    let sane = (-60..=60).contains(&manifest.lattice_exponent)
+        && manifest.lattice_origin.iter().all(|c| c.unsigned_abs() < 1 << 62)
+        && manifest
+            .low
+            .iter()
+            .zip(&manifest.high)
+            .all(|(l, h)| l <= h && l.abs() <= 1 << 30 && h.abs() <= 1 << 30)
+        && manifest.shifts.iter().all(|&shift| shift <= SHIFT_MAX)
+        && manifest.bytes <= u64::from(manifest.bricks) * BYTES_MAX as u64;
+    if !sane {
+        return Err(
+            Error::corrupt(path, 0, "impossible numbers in the manifest").hint("build the brick map again")
+        );
+    }
+    Ok(manifest)
 }

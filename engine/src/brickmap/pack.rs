@@ -7,14 +7,11 @@
 use super::bvh::{WideChild, WideTree};
 use super::farfield;
 use crate::brick::node::WIDTH;
-use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble, leaf};
+use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble};
 
 /// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
 /// larger ones load what a batch does not touch.
-pub const TREELET_BYTES: usize = 12 << 10;
-
-/// Bytes of a reference to another brick.
-const REFERENCE_BYTES: usize = 8;
+const TREELET_BYTES: usize = 12 << 10;
 
 /// What a primitive of the tree is.
 #[derive(Clone, Copy, Debug)]
@@ -54,42 +51,6 @@ pub struct Packed {
     pub lengths: Vec<u32>,
     /// Bytes by what they are for.
     pub split: ByteSplit,
-    /// How good the tree is.
-    pub tree: TreeStats,
-}
-
-/// What a tree is worth.
-#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct TreeStats {
-    /// Nodes.
-    pub nodes: u64,
-    /// Children of all nodes.
-    pub children: u64,
-    /// Leaves.
-    pub leaves: u64,
-    /// Vertices in the leaves; those on the border of two are counted in both.
-    pub vertices: u64,
-    /// Half the areas of all nodes' boxes. Over that of the root's box: the nodes that a line through it visits.
-    pub node_half_area: f64,
-    /// Half the areas of all leaves' boxes.
-    pub leaf_half_area: f64,
-}
-
-impl std::ops::AddAssign for TreeStats {
-    fn add_assign(&mut self, other: Self) {
-        self.nodes += other.nodes;
-        self.children += other.children;
-        self.leaves += other.leaves;
-        self.vertices += other.vertices;
-        self.node_half_area += other.node_half_area;
-        self.leaf_half_area += other.leaf_half_area;
-    }
-}
-
-/// Half the area of a box in squared lattice steps.
-pub fn half_area(bounds: &LatticeBox) -> f64 {
-    let size = (bounds.max - bounds.min).as_dvec3();
-    size.x * size.y + size.y * size.z + size.z * size.x
 }
 
 /// Where a brick map's bytes go.
@@ -99,10 +60,8 @@ pub struct ByteSplit {
     pub nodes: u64,
     /// Far field.
     pub far_field: u64,
-    /// Leaves, index tables included.
+    /// Leaves.
     pub leaves: u64,
-    /// The leaves' index tables.
-    pub indices: u64,
     /// Brick headers, tables and padding.
     pub headers: u64,
     /// The directory.
@@ -114,7 +73,6 @@ impl std::ops::AddAssign for ByteSplit {
         self.nodes += other.nodes;
         self.far_field += other.far_field;
         self.leaves += other.leaves;
-        self.indices += other.indices;
         self.headers += other.headers;
         self.directory += other.directory;
     }
@@ -134,72 +92,31 @@ struct Subtree {
     is_brick: bool,
 }
 
-/// How to cut a tree into bricks.
-#[derive(Clone, Copy, Debug)]
-pub struct Cut {
-    /// The number of the first brick.
-    pub first_number: u32,
-    /// [`TREELET_BYTES`], or less in tests.
-    pub treelet_bytes: usize,
-    /// Roots that the tree may be opened into, for the sake of a higher tree over them.
-    pub roots_max: usize,
-}
-
-/// Packs `tree` over `primitives` into bricks. `leaves` holds the encoded leaves. Returns the root bricks as primitives of a
-/// higher tree: nodes above them are dropped, and the last brick is the last root.
+/// Packs `tree` over `primitives` into bricks numbered from `first_number` on. `leaves` holds the encoded leaves. Returns the
+/// root brick as a primitive of a higher tree.
 pub fn pack(
     tree: &WideTree,
     primitives: &[Primitive],
     leaves: &[u8],
-    cut: Cut,
+    first_number: u32,
     out: &mut Packed,
-) -> Vec<Primitive> {
-    let mut subtrees = measure(tree, primitives, cut.treelet_bytes, &mut out.tree);
-    let roots = open_roots(tree, &subtrees, cut.roots_max, &mut out.tree);
-    roots.iter().for_each(|&root| subtrees[root as usize].is_brick = true);
-    let mut packer =
-        Packer { tree, primitives, leaves, subtrees: &subtrees, first_number: cut.first_number, out };
-    let primitive = |root: u32| {
-        let Subtree { bounds, area, opaque_area, micropolygons, .. } = subtrees[root as usize];
-        let content = Content::Brick(packer.brick(root));
-        Primitive { bounds, area: area as f32, opaque_area: opaque_area as f32, micropolygons, content }
-    };
-    roots.into_iter().map(primitive).collect()
-}
-
-/// Opens the largest nodes from the root down into their children while these are at most `roots_max`; nodes with leaves of
-/// their own stay. The opened ones are taken from `stats`.
-fn open_roots(tree: &WideTree, subtrees: &[Subtree], roots_max: usize, stats: &mut TreeStats) -> Vec<u32> {
-    let inner = |child: &WideChild| matches!(child, WideChild::Node(_));
-    let mut roots = vec![0];
-    loop {
-        let can_open = |&(_, root): &(usize, &u32)| {
-            let node = &tree.nodes[*root as usize];
-            let children = &node.children[..usize::from(node.count)];
-            roots.len() - 1 + children.len() <= roots_max && children.iter().all(inner)
-        };
-        let area = |&(_, root): &(usize, &u32)| half_area(&subtrees[*root as usize].bounds);
-        let largest = roots.iter().enumerate().filter(can_open).max_by(|a, b| area(a).total_cmp(&area(b)));
-        let Some((at, &root)) = largest else { return roots };
-        let node = &tree.nodes[root as usize];
-        let children = node.children[..usize::from(node.count)].iter().filter_map(|child| match *child {
-            WideChild::Node(child) => Some(child),
-            WideChild::Primitive(_) => None,
-        });
-        stats.nodes -= 1;
-        stats.children -= u64::from(node.count);
-        stats.node_half_area -= half_area(&subtrees[root as usize].bounds);
-        roots.splice(at..=at, children);
+) -> Primitive {
+    let mut subtrees = measure(tree, primitives);
+    subtrees[0].is_brick = true;
+    let mut packer = Packer { tree, primitives, leaves, subtrees: &subtrees, first_number, out };
+    let number = packer.brick(0);
+    let root = &subtrees[0];
+    Primitive {
+        bounds: root.bounds,
+        area: root.area as f32,
+        opaque_area: root.opaque_area as f32,
+        micropolygons: root.micropolygons,
+        content: Content::Brick(number),
     }
 }
 
 /// Sums up every subtree and decides which become bricks.
-fn measure(
-    tree: &WideTree,
-    primitives: &[Primitive],
-    treelet_bytes: usize,
-    stats: &mut TreeStats,
-) -> Vec<Subtree> {
+fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
     let empty = Subtree {
         bounds: LatticeBox::EMPTY,
         area: 0.0,
@@ -223,12 +140,8 @@ fn measure(
                     sum.opaque_area += f64::from(p.opaque_area);
                     sum.micropolygons += p.micropolygons;
                     sum.bytes += match p.content {
-                        Content::Leaf { bytes, .. } => {
-                            stats.leaves += 1;
-                            stats.leaf_half_area += half_area(&p.bounds);
-                            bytes as usize
-                        }
-                        Content::Brick(_) => REFERENCE_BYTES,
+                        Content::Leaf { bytes, .. } => bytes as usize,
+                        Content::Brick(_) => 8,
                     };
                 }
                 WideChild::Node(child) => {
@@ -248,16 +161,13 @@ fn measure(
         let inner = &mut inner[..inner_count];
         inner.sort_by_key(|&child| std::cmp::Reverse(subtrees[child].bytes));
         for &child in inner.iter() {
-            if sum.bytes <= treelet_bytes && sum.nodes <= CHILDREN_MAX / WIDTH {
+            if sum.bytes <= TREELET_BYTES && sum.nodes <= CHILDREN_MAX / WIDTH {
                 break;
             }
-            sum.bytes -= subtrees[child].bytes - REFERENCE_BYTES;
+            sum.bytes -= subtrees[child].bytes - 8;
             sum.nodes -= subtrees[child].nodes;
             subtrees[child].is_brick = true;
         }
-        stats.nodes += 1;
-        stats.children += u64::from(node.count);
-        stats.node_half_area += half_area(&sum.bounds);
         subtrees[index] = sum;
     }
     subtrees
@@ -291,7 +201,7 @@ impl Packer<'_> {
             at += 1;
         }
         let (mut nodes, mut table, mut leaves) = (Vec::with_capacity(members.len()), Vec::new(), Vec::new());
-        let (mut micropolygons, mut index_bytes) = (0, 0);
+        let mut micropolygons = 0;
         let mut next_member = 1;
         for &member in &members {
             let wide = self.tree.nodes[member as usize];
@@ -305,7 +215,7 @@ impl Packer<'_> {
                 let reference = match *child {
                     WideChild::Node(child) if self.subtrees[child as usize].is_brick => {
                         table.push(self.brick(child));
-                        Child::Brick((table.len() - 1) as _)
+                        Child::Brick((table.len() - 1) as u16)
                     }
                     WideChild::Node(_) => {
                         next_member += 1;
@@ -316,17 +226,15 @@ impl Packer<'_> {
                         match primitive.content {
                             Content::Leaf { offset, bytes } => {
                                 let here = (leaves.len() / 8) as u16;
-                                let leaf = &self.leaves[offset as usize..(offset + bytes) as usize];
-                                leaves.extend_from_slice(leaf);
-                                let layout = leaf::Layout::read_trusted(leaf);
-                                index_bytes += (layout.coordinates[0] - leaf::HEADER_BYTES) as u64;
-                                self.out.tree.vertices += layout.vertices as u64;
+                                leaves.extend_from_slice(
+                                    &self.leaves[offset as usize..(offset + bytes) as usize],
+                                );
                                 micropolygons += primitive.micropolygons as u32;
                                 Child::Leaf(here)
                             }
                             Content::Brick(number) => {
                                 table.push(number);
-                                Child::Brick((table.len() - 1) as _)
+                                Child::Brick((table.len() - 1) as u16)
                             }
                         }
                     }
@@ -346,7 +254,6 @@ impl Packer<'_> {
             nodes: node_bytes,
             far_field,
             leaves: leaves.len() as u64,
-            indices: index_bytes,
             headers: length as u64 - node_bytes - far_field - leaves.len() as u64,
             directory: 0,
         };
