@@ -243,8 +243,9 @@ fn a_row_of_robot_parts() {
         (0..4).map(|i| copy(DVec3::Z, DVec3::new(0.4 * f64::from(i), 0.0, 0.2), f64::from(i * 37))).collect();
     let case = case.geometry("parts", &["robots_obj/hand.obj", "robots_obj/link6.obj"], &places);
     let report = case.bake(32, Some(40_000));
-    let placed = 4 * (7_078 + 21_620);
-    assert!((placed - 400..=placed).contains(&report.micropolygons), "{}", report.micropolygons);
+    // Two of link6's triangles have no area, and it has a line that belongs to no face
+    assert_eq!(report.micropolygons, 4 * (7_078 + 21_620 - 2 + 1));
+    assert_eq!(report.skipped, [("degenerate faces (a repeated vertex or no area)".to_string(), 2)]);
     let parts = case.coefficients("parts");
     assert_eq!(parts.instances.len(), 4);
     parts.assert_sane("parts", 0.5..0.75, 0.15);
