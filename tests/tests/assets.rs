@@ -165,7 +165,7 @@ fn leaf_cards_of_a_tree() {
     let report = case.bake(64, None);
     assert_eq!((report.micropolygons, report.bake.points), (6_775, 13_492));
     assert_eq!(report.skipped, [("occluding faces without area".to_string(), 31)]);
-    case.coefficients("oak").assert_sane("oak", 0.2..0.6, 0.1);
+    case.coefficients("oak").assert_sane("oak", 0.45..0.65, 0.02);
 }
 
 /// Catches blended cards that occlude fully or not at all, and a gltf whose missing picture stops the bake.
@@ -175,7 +175,7 @@ fn blended_cards_of_a_pine() {
     let case = case.geometry("pine", &["pine_gltf/scene.gltf"], &[]);
     let report = case.bake(128, None);
     assert_eq!(report.bake.points, 4_406);
-    case.coefficients("pine").assert_sane("pine", 0.4..0.8, 0.1);
+    case.coefficients("pine").assert_sane("pine", 0.55..0.75, 0.06);
 }
 
 /// Catches instances that are lost, doubled or misplaced between an instance file and the result.
@@ -196,9 +196,9 @@ fn a_forest_of_instances() {
     let faces = [1_408, 3 * 34_482, 1_561 * placed.len() as u64];
     assert_eq!(report.micropolygons, faces.iter().sum::<u64>());
     for ((set, count), (open, dark)) in ["ground", "trees", "twigs"].into_iter().zip(faces).zip([
-        (0.8..1.0, 0.0),
-        (0.2..0.6, 0.1),
-        (0.2..0.7, 0.1),
+        (0.93..1.0, 0.0),
+        (0.4..0.6, 0.02),
+        (0.35..0.55, 0.12),
     ]) {
         let found = case.coefficients(set);
         assert_eq!(found.faces, count, "{set}");
@@ -226,13 +226,13 @@ fn a_crowd_of_characters() {
     let case = case.geometry("knights", &["quaternius_obj/KnightCharacter.obj"], &places).geometry(
         "suit",
         &["quaternius_obj/Smooth_Male_Suit.obj"],
-        &[],
+        &[copy(DVec3::Y, DVec3::new(350.0, 0.0, 250.0), 10.0)],
     );
     case.bake(64, None);
     let knights = case.coefficients("knights");
     assert_eq!(knights.instances.len(), 9);
-    knights.assert_sane("knights", 0.5..0.9, 0.1);
-    case.coefficients("suit").assert_sane("suit", 0.4..0.9, 0.15);
+    knights.assert_sane("knights", 0.7..0.87, 0.02);
+    case.coefficients("suit").assert_sane("suit", 0.5..0.75, 0.2);
 }
 
 /// Catches hard surfaces of long thin triangles, in metres with z up, that shadow themselves.
@@ -243,11 +243,12 @@ fn a_row_of_robot_parts() {
         (0..4).map(|i| copy(DVec3::Z, DVec3::new(0.4 * f64::from(i), 0.0, 0.2), f64::from(i * 37))).collect();
     let case = case.geometry("parts", &["robots_obj/hand.obj", "robots_obj/link6.obj"], &places);
     let report = case.bake(32, Some(40_000));
-    // Of the four, a line that belongs to no face
-    assert!(report.warnings.iter().all(|warning| !warning.contains("normal")), "{:?}", report.warnings);
+    // Two of link6's triangles have no area, and it has a line that belongs to no face
+    assert_eq!(report.micropolygons, 4 * (7_078 + 21_620 - 2 + 1));
+    assert_eq!(report.skipped, [("degenerate faces (a repeated vertex or no area)".to_string(), 2)]);
     let parts = case.coefficients("parts");
     assert_eq!(parts.instances.len(), 4);
-    parts.assert_sane("parts", 0.2..0.8, 0.4);
+    parts.assert_sane("parts", 0.5..0.75, 0.15);
 }
 
 /// Catches lost precision: a terrain 4,100 km from the origin bakes to the same numbers as the same at the origin.
@@ -275,7 +276,7 @@ fn terrain_far_from_the_origin() {
     near.bake(32, Some(30_000));
 
     let (far, near) = (far.coefficients("terrain"), near.coefficients("terrain"));
-    far.assert_sane("terrain", 0.9..1.0, 0.0);
+    far.assert_sane("terrain", 0.84..0.91, 0.0);
     assert_eq!(far.values.len(), near.values.len());
     let pairs = far.values.iter().flatten().zip(near.values.iter().flatten());
     let largest = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -287,10 +288,10 @@ fn terrain_far_from_the_origin() {
 fn a_cloud_of_points_without_radius() {
     let Some(case) = Case::new("m", "y") else { return };
     let case = case.geometry("pond", &["points/pond.0.ply"], &[]);
-    let report = case.bake(32, Some(20_000));
+    let report = case.bake(32, None);
     assert_eq!(report.micropolygons, 70_051);
     assert!(report.warnings.iter().any(|warning| warning.contains("without a radius")));
     let pond = case.coefficients("pond");
     assert_eq!(pond.vertices, 70_051);
-    pond.assert_sane("pond", 0.2..0.8, 0.1);
+    pond.assert_sane("pond", 0.35..0.65, 0.02);
 }

@@ -287,7 +287,7 @@ fn xxh(name: &str) -> u32 {
 fn the_same_bits_however_it_is_traced() {
     let folder = tempfile::tempdir().unwrap();
     let mut scene = MemoryStream::new();
-    for i in 0..60 {
+    for i in 0..120 {
         let center = DVec3::new(f64::from(i % 8), f64::from(i / 8), f64::from(i % 5) * 0.3);
         scene.push_sphere(center, 0.45, 80, if i % 3 == 0 { 0.6 } else { 1.0 });
     }

@@ -489,6 +489,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
     #[inline(never)]
     fn visit_round_leaf(&mut self, leaf: &[u8], layout: &Layout, count: usize) {
         let reach = f64::from(self.bundle.reach);
+        let decoded: [_; leaf::FACES_MAX] =
+            std::array::from_fn(|face| layout.face(leaf, face.min(layout.faces - 1)));
         for i in 0..count {
             let ray = self.scratch.current[i];
             let origin =
@@ -496,9 +498,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             let (position, direction) = (origin.position, self.bundle.directions[usize::from(ray)]);
             let direction = Vec3::from_slice(&direction[..3]).as_dvec3();
             let mut faces = 0;
-            for face in 0..layout.faces {
-                let met = intersect::meets(&layout.face(leaf, face), position, direction, reach);
-                faces |= u8::from(met) << face;
+            for (face, decoded) in decoded[..layout.faces].iter().enumerate() {
+                faces |= u8::from(intersect::meets(decoded, position, direction, reach)) << face;
             }
             if faces != 0 {
                 self.meet_faces(leaf, layout, ray, faces);
