@@ -3,8 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use glam::DMat4;
+use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
+use super::folder::write_atomically;
 use crate::import::{GridSink, ImportOptions, ImportReport, import, is_importable};
 use crate::scene::instances::InstanceReader;
 use crate::scene::{Geometry, Instances, Scene, StreamSource};
@@ -24,6 +26,19 @@ pub struct Inputs {
     /// What the imports reported.
     pub reports: Vec<(PathBuf, ImportReport)>,
 }
+
+/// [`Inputs`] as they are kept beside what was imported.
+#[derive(Serialize, Deserialize)]
+struct Saved {
+    version: u32,
+    /// Relative to the folder where they were imported into it.
+    files: Vec<Vec<Option<PathBuf>>>,
+    /// In hexadecimal.
+    identities: Vec<String>,
+}
+
+const SAVED_FILE: &str = "inputs.json";
+const SAVED_VERSION: u32 = 1;
 
 impl Inputs {
     /// Imports the files of `scene` that are no microgrid streams into `folder`, and hashes everything.
@@ -80,6 +95,43 @@ impl Inputs {
             inputs.identities.push(hash.digest128());
         }
         Ok(inputs)
+    }
+
+    /// Leaves a record in `folder`, into which the files were imported, for [`load`](Self::load).
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn save(&self, folder: &Path) -> Result<()> {
+        let relative = |file: &PathBuf| file.strip_prefix(folder).unwrap_or(file).to_path_buf();
+        let files = self.files.iter().map(|files| files.iter().map(|f| f.as_ref().map(relative)).collect());
+        let identities = self.identities.iter().map(|identity| format!("{identity:032x}"));
+        let saved =
+            Saved { version: SAVED_VERSION, files: files.collect(), identities: identities.collect() };
+        let json = serde_json::to_vec(&saved).map_err(|e| Error::invalid(e.to_string()))?;
+        write_atomically(&folder.join(SAVED_FILE), &json)
+    }
+
+    /// The inputs of `scene` as [`save`](Self::save) left them in `folder`, without importing again.
+    ///
+    /// # Errors
+    /// When there is no record, or it is not one of this scene.
+    pub fn load(scene: &Scene, folder: &Path) -> Result<Self> {
+        let path = folder.join(SAVED_FILE);
+        let bytes = std::fs::read(&path).map_err(|error| Error::io("read", &path, error))?;
+        let damaged = || Error::corrupt(&path, 0, "this is not a record of the scene's imported inputs");
+        let saved: Saved = serde_json::from_slice(&bytes).map_err(|error| damaged().caused_by(error))?;
+        let identities = saved.identities.iter().map(|text| u128::from_str_radix(text, 16));
+        let identities = identities.collect::<Result<Vec<_>, _>>().map_err(|_| damaged())?;
+        let counts = scene.geometries.iter().map(|geometry| geometry.streams.len());
+        if saved.version != SAVED_VERSION
+            || identities.len() != saved.files.len()
+            || !counts.eq(saved.files.iter().map(Vec::len))
+        {
+            return Err(damaged());
+        }
+        let absolute = |file: PathBuf| folder.join(file);
+        let files = saved.files.into_iter().map(|files| files.into_iter().map(|f| f.map(absolute)).collect());
+        Ok(Self { files: files.collect(), identities, reports: Vec::new() })
     }
 
     /// The stream of a geometry in the scene's units and axes, instances expanded.

@@ -1,6 +1,7 @@
 //! The files a scene names: frame patterns, known types, and whether they are there.
 
-use std::path::{Path, PathBuf};
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
 
 use super::element::Value;
 use super::xml::cut;
@@ -16,12 +17,17 @@ const FRAME_DIGITS_MAX: usize = 9;
 /// Entries of a folder to look at, at most, for a name like the one that is missing.
 const FOLDER_ENTRIES_MAX: usize = 4096;
 
+/// Folders by name that a scene from elsewhere may read, as `root:NAME/path`, besides its own folder.
+pub type Roots = BTreeMap<String, PathBuf>;
+
 /// How paths in a scene become files.
 pub(super) struct Files<'a> {
     /// The folder of the scene file.
     pub base: &'a Path,
     /// The frame that patterns stand for.
     pub frame: Option<i64>,
+    /// Set for a scene that is not trusted: nothing but the scene's folder and these may be read.
+    pub roots: Option<&'a Roots>,
 }
 
 impl Files<'_> {
@@ -65,8 +71,44 @@ impl Files<'_> {
             let message = format!("path `{}` has a frame pattern, but no frame was given", cut(value.text()));
             return Err(value.error(ErrorKind::Invalid, message).hint("choose one: `--frame N`"));
         };
-        Ok(self.base.join(path))
+        match self.roots {
+            None => Ok(self.base.join(path)),
+            Some(roots) => confined(value, self.base, roots, &path),
+        }
     }
+}
+
+/// The file that `path` means below `base` or one of the `roots`; links may not lead out.
+fn confined(value: &Value<'_>, base: &Path, roots: &Roots, path: &str) -> Result<PathBuf> {
+    let (root, rest) = match path.strip_prefix("root:") {
+        None => (base, path),
+        Some(path) => {
+            let (name, rest) = path.split_once('/').unwrap_or((path, ""));
+            let Some(root) = roots.get(name) else {
+                let error =
+                    value.error(ErrorKind::NotFound, format!("no asset root is called `{}`", cut(name)));
+                return Err(match nearest(name, roots.keys().map(String::as_str)) {
+                    Some(near) => error.hint(format!("did you mean `root:{near}/`?")),
+                    None => error.hint("asset roots are set up by whoever runs the service"),
+                });
+            };
+            (root.as_path(), rest)
+        }
+    };
+    let inside = |component| matches!(component, Component::Normal(_) | Component::CurDir);
+    let target = root.join(rest);
+    let leads_out = || match (target.canonicalize(), root.canonicalize()) {
+        (Ok(target), Ok(root)) => !target.starts_with(root),
+        // What is not there leads nowhere, and is refused by name later
+        _ => false,
+    };
+    if !Path::new(rest).components().all(inside) || leads_out() {
+        let message = format!("path `{}` leads out of the folder it is in", cut(path));
+        return Err(value
+            .error(ErrorKind::Invalid, message)
+            .hint("name files below the scene's folder, or as `root:NAME/path` below an asset root"));
+    }
+    Ok(target)
 }
 
 /// Puts a frame number where a path has two or more `#`, `%d` or `%04d` (any width up to 9). None if there is such a

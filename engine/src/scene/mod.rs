@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 
 use glam::DMat4;
 
+pub use self::files::Roots;
 pub use self::instances::{InstanceReader, for_each_instance};
 pub use self::parse::UNITS;
 pub use self::xml::{DEPTH_MAX, ELEMENTS_MAX, SCENE_BYTES_MAX, VALUE_BYTES_MAX};
@@ -43,6 +44,20 @@ pub fn load(path: &Path) -> Result<Scene> {
 /// # Errors
 /// [`ErrorKind::NotFound`] and [`ErrorKind::Io`] for the file itself, and those of [`parse_frame`].
 pub fn load_frame(path: &Path, frame: Option<i64>) -> Result<Scene> {
+    parse_frame(path, &read(path)?, frame)
+}
+
+/// Reads and checks a scene file from elsewhere: it may name files below its own folder and, as `root:NAME/path`, below
+/// `roots`, and no others.
+///
+/// # Errors
+/// As [`load_frame`]; [`ErrorKind::Invalid`] for a path that leads out of its folder.
+pub fn load_confined(path: &Path, frame: Option<i64>, roots: &Roots) -> Result<Scene> {
+    parse::scene(&xml::Document::parse(path, &read(path)?)?, frame, Some(roots))
+}
+
+/// A scene file's text.
+fn read(path: &Path) -> Result<String> {
     let file = File::open(path).map_err(|source| Error::io("open scene", path, source))?;
     let mut bytes = Vec::new();
     // One byte more than allowed tells a file that is too long, however long it claims to be
@@ -51,8 +66,7 @@ pub fn load_frame(path: &Path, frame: Option<i64>) -> Result<Scene> {
     if bytes.len() > SCENE_BYTES_MAX {
         return Err(xml::too_long(bytes.len() as u64).at(path));
     }
-    let text = std::str::from_utf8(&bytes).map_err(|error| not_utf8(path, &bytes, error))?;
-    parse_frame(path, text, frame)
+    String::from_utf8(bytes).map_err(|error| not_utf8(path, error.as_bytes(), error.utf8_error()))
 }
 
 /// Checks the text of a scene whose paths have no frame patterns.
@@ -70,7 +84,7 @@ pub fn parse(path: &Path, text: &str) -> Result<Scene> {
 /// with the text, [`ErrorKind::NotFound`] for a file that is not there, [`ErrorKind::Unsupported`] for what the
 /// grammar declares and this version cannot do yet, [`ErrorKind::Limit`] beyond a stated limit.
 pub fn parse_frame(path: &Path, text: &str, frame: Option<i64>) -> Result<Scene> {
-    parse::scene(&xml::Document::parse(path, text)?, frame)
+    parse::scene(&xml::Document::parse(path, text)?, frame, None)
 }
 
 fn not_utf8(path: &Path, bytes: &[u8], error: std::str::Utf8Error) -> Error {

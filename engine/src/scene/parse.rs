@@ -1,7 +1,7 @@
 //! The tree becomes a scene: its head, its cameras, and its shaders and geometries in the order they need each other.
 
 use super::element::{Element, Value};
-use super::files::Files;
+use super::files::{Files, Roots};
 use super::geometry::Geometries;
 use super::names::Names;
 use super::shader::shader;
@@ -24,7 +24,7 @@ pub const UNITS: [(&str, f64); 7] =
     [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("km", 1000.0), ("in", 0.0254), ("ft", 0.3048), ("yd", 0.9144)];
 
 /// Makes a scene of a document.
-pub(super) fn scene(document: &Document<'_>, frame: Option<i64>) -> Result<Scene> {
+pub(super) fn scene(document: &Document<'_>, frame: Option<i64>, roots: Option<&Roots>) -> Result<Scene> {
     let root = Element::root(document);
     check_head(root)?;
     let meters_per_unit = root.required("units")?.choice("unit", &UNITS)?;
@@ -46,7 +46,7 @@ pub(super) fn scene(document: &Document<'_>, frame: Option<i64>) -> Result<Scene
 
     let elements = section(root, "geometries", "geometry")?;
     let base = document.path.parent().unwrap_or("".as_ref());
-    let files = Files { base, frame };
+    let files = Files { base, frame, roots };
     let mut declared = Geometries::declare(&elements, files, &camera_names, &shader_names)?;
     if declared.occluders.is_empty() {
         let message = "scene has no occluder, expected a geometry with `occluder=\"true\"`";

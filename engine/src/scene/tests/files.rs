@@ -42,6 +42,28 @@ fn files_are_found_beside_the_scene() {
     assert_eq!(scene.unwrap().geometries[0].streams, [StreamSource::File(elsewhere.path().into())]);
 }
 
+/// Catches a scene from elsewhere that reads a file of this machine by an absolute path, by `..` or through a link.
+#[test]
+fn confined_scenes_stay_in_their_folders() {
+    let outside = tempfile::tempdir().unwrap();
+    std::fs::write(outside.path().join("secret.obj"), "").unwrap();
+    let roots = Roots::from([("props".to_string(), outside.path().to_path_buf())]);
+    let load = |stream: &str| {
+        let (folder, _) = with_files(stream, "scatter.csv", None);
+        #[cfg(unix)]
+        std::os::unix::fs::symlink(outside.path(), folder.path().join("link")).unwrap();
+        load_confined(&folder.path().join("scene.xml"), None, &roots).map(|scene| scene.geometries.len())
+    };
+    assert_eq!(load("tree.obj").unwrap() + load("root:props/secret.obj").unwrap(), 2);
+    let absolute = outside.path().join("secret.obj");
+    let up = format!("../{}/secret.obj", outside.path().file_name().unwrap().to_str().unwrap());
+    for path in [absolute.to_str().unwrap(), &up, "root:props/../secret.obj", "link/secret.obj"] {
+        let error = load(path).unwrap_err();
+        assert!(error.message().contains("leads out"), "{path}: {error}");
+    }
+    assert_eq!(load("root:prop/secret.obj").unwrap_err().hint_text(), Some("did you mean `root:props/`?"));
+}
+
 /// Catches a file that is missing or of an unknown type and is noticed only hours into a bake.
 #[test]
 fn missing_and_unknown_files_are_refused() {

@@ -1,0 +1,62 @@
+//! What tracing took, added up over batches and bake sets.
+
+use super::BakeOptions;
+use crate::stats::BakeReport;
+use crate::trace::{BatchCounts, SphericalTracer};
+
+/// What all bake sets together took.
+#[derive(Debug, Default)]
+pub struct BakeWork {
+    /// Batches traced.
+    pub batches: u64,
+    /// Rays traced.
+    pub rays: u64,
+    /// Seconds of selecting, loading, tracing and projecting.
+    pub seconds: f64,
+    counts: BatchCounts,
+    requests: u64,
+    misses: u64,
+    read_bytes: u64,
+}
+
+impl BakeWork {
+    pub(super) fn add(&mut self, counts: &BatchCounts) {
+        self.rays += counts.rays;
+        self.counts.walk += counts.walk;
+        self.counts.cut_bytes += counts.cut_bytes;
+        self.counts.select_seconds += counts.select_seconds;
+    }
+
+    pub(super) fn add_arena(&mut self, tracer: &SphericalTracer) {
+        let counts = tracer.arena_counts();
+        self.requests += counts.requests;
+        self.misses += counts.misses;
+        self.read_bytes += counts.read_bytes;
+    }
+
+    /// The tracing part of a report.
+    pub fn report(&self, options: &BakeOptions) -> BakeReport {
+        let ratio = |a: u64, b: u64| a as f64 / b.max(1) as f64;
+        let walk = &self.counts.walk;
+        BakeReport {
+            rays: self.rays,
+            batches: self.batches,
+            seconds: self.seconds,
+            rays_per_second: self.rays as f64 / self.seconds.max(1e-9),
+            device: "cpu".into(),
+            instructions: options.instructions.name().into(),
+            threads: options.threads as u64,
+            lod: options.lod.to_string(),
+            io_bytes_per_ray: ratio(self.read_bytes, self.rays),
+            io_bytes_per_batch: ratio(self.read_bytes, self.batches),
+            cache_hit_ratio: 1.0 - ratio(self.misses, self.requests),
+            double_precision_ratio: ratio(walk.retests, walk.hits),
+            nodes_per_ray: ratio(walk.nodes, self.rays),
+            rays_per_node_visit: ratio(walk.node_rays, walk.nodes),
+            leaves_per_ray: ratio(walk.leaves, self.rays),
+            cut_bytes_per_batch: ratio(self.counts.cut_bytes, self.batches),
+            select_seconds: self.counts.select_seconds,
+            ..BakeReport::default()
+        }
+    }
+}
