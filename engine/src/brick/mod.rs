@@ -2,7 +2,7 @@
 //!
 //! A brick is a treelet of at most 256 nodes with all its leaves, contiguous in memory and on disk. Inside it, all
 //! references are 14 bits; a child may be another brick. [`lattice`] has the integer coordinates, [`node`] and
-//! [`leaf`] the two records, [`intersect`] rays against faces, [`bundle`] the rays of a few points, [`lanes`] the inner
+//! [`leaf`] the two records, [`far`] what stands in for a child, [`intersect`] rays against faces, [`bundle`] the rays of a few points, [`lanes`] the inner
 //! loops per instruction set, [`walk`] any hit over bricks.
 //!
 //! ```text
@@ -18,6 +18,7 @@
 //! ```
 
 pub mod bundle;
+pub mod far;
 pub mod intersect;
 pub mod lanes;
 pub mod lattice;

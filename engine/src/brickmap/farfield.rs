@@ -6,9 +6,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::brick::LatticeBox;
 use crate::brick::leaf::{EXTINCTION_PER_OCTAVE, Face, OPAQUE, extinction_from_opacity};
-use crate::brick::node::FAR_BYTES;
+use crate::brick::{LatticeBox, far};
 
 /// Which far field a brick map has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -37,13 +36,12 @@ pub fn opacity(extinction: u16) -> f32 {
 }
 
 /// The far field of a child with the given decoded box and sums of areas.
-pub fn paper(bounds: &LatticeBox, area: f32, opaque_area: f32) -> [u8; FAR_BYTES] {
+pub fn paper(bounds: &LatticeBox, area: f32, opaque_area: f32) -> far::Record {
     let size = (bounds.max - bounds.min).as_vec3();
     let surface = 2.0 * (size.x * size.y + size.y * size.z + size.z * size.x);
     let covered = if surface > 0.0 { (area / surface).min(1.0) } else { 1.0 };
     let mean_opacity = if area > 0.0 { opaque_area / area } else { 0.0 };
-    let [low, high] = extinction_from_opacity(covered * mean_opacity).to_le_bytes();
-    [low, high, 0, 0, 0, 0]
+    far::scalar(extinction_from_opacity(covered * mean_opacity))
 }
 
 #[cfg(test)]
@@ -58,6 +56,6 @@ mod tests {
         assert_eq!(paper(&cube, 600.0, 600.0)[..2], OPAQUE.to_le_bytes());
         let wall = LatticeBox { min: IVec3::ZERO, max: IVec3::new(10, 10, 0) };
         assert_eq!(paper(&wall, 100.0, 100.0)[..2], 4096_u16.to_le_bytes());
-        assert_eq!(paper(&wall, 100.0, 0.0)[..2], [0, 0]);
+        assert_eq!(paper(&wall, 100.0, 0.0), far::scalar(0));
     }
 }
