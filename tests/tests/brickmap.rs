@@ -103,8 +103,8 @@ fn every_micropolygon_is_there_once() {
             for slot in 0..usize::from(node.count) {
                 let Some(Child::Leaf(offset)) = node.child(slot) else { continue };
                 let bytes = brick.at(index, offset);
-                let layout = Layout::read(bytes).unwrap();
                 let LatticeBox { min, max } = node.child_box(slot);
+                let layout = Layout::read(bytes, min).unwrap();
                 for face in (0..layout.faces).map(|face| layout.face(bytes, face)) {
                     let bounds = face.bounds();
                     assert!(min.cmple(bounds.min).all() && max.cmpge(bounds.max).all());
@@ -168,7 +168,7 @@ fn damaged_maps_are_refused() {
     let manifest = target.join("manifest.json");
     let text = std::fs::read_to_string(&manifest).unwrap();
     let lies = [
-        ("\"version\": 1", "\"version\": 2", ErrorKind::Unsupported),
+        ("\"version\": 2", "\"version\": 3", ErrorKind::Unsupported),
         ("\"bricks\": ", "\"bricks\": 4", ErrorKind::Corrupt),
         ("\"lattice_exponent\": ", "\"lattice_exponent\": 99", ErrorKind::Corrupt),
         ("{", "[", ErrorKind::Corrupt),

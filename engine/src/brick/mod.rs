@@ -39,8 +39,8 @@ pub const HEADER_BYTES: usize = 64;
 pub const NODES_MAX: usize = 256;
 /// Other bricks that a brick may refer to.
 pub const CHILDREN_MAX: usize = 256;
-/// Bytes of a brick at most: leaf offsets have 14 bits of 8 bytes.
-pub const BYTES_MAX: usize = 8 << node::LOCATION_BITS;
+/// Bytes of a brick at most: locations have 14 bits of 4 bytes.
+pub const BYTES_MAX: usize = node::LOCATION_BYTES << node::LOCATION_BITS;
 /// Bricks start and end at multiples of this, on disk and in the arena.
 pub const ALIGNMENT: usize = 64;
 
@@ -107,22 +107,22 @@ impl<'a> Brick<'a> {
                 let sound = match node.child(slot) {
                     // Children come after their parents and have one only: no cycles, no blow-up
                     Some(Child::Node(offset)) => {
-                        let distance = 8 * usize::from(offset);
+                        let distance = node::LOCATION_BYTES * usize::from(offset);
                         let child = index + distance / size_of::<Node>();
-                        distance % size_of::<Node>() == 0
+                        distance.is_multiple_of(size_of::<Node>())
                             && child > index
                             && child < nodes
                             && !std::mem::replace(&mut has_parent[child], true)
                     }
                     Some(Child::Brick(offset)) => {
-                        let at = from + 8 * usize::from(offset);
-                        at >= table && at < table + 8 * children
+                        let at = from + node::LOCATION_BYTES * usize::from(offset);
+                        at >= table && at < table + 8 * children && (at - table).is_multiple_of(8)
                     }
                     Some(Child::Leaf(offset)) => {
-                        let at = from + 8 * usize::from(offset);
+                        let at = from + node::LOCATION_BYTES * usize::from(offset);
                         at >= leaves
                             && at < length
-                            && leaf::Layout::read(&bytes[at..length])
+                            && leaf::Layout::read(&bytes[at..length], node.child_box(slot).min)
                                 .is_some_and(|l| l.is_sound(&bytes[at..]))
                     }
                     None => false,
@@ -165,7 +165,7 @@ impl<'a> Brick<'a> {
 
     /// The bytes from what a node refers to on.
     pub fn at(&self, node: usize, offset: u16) -> &'a [u8] {
-        &self.bytes[HEADER_BYTES + node * size_of::<Node>() + 8 * usize::from(offset)..]
+        &self.bytes[HEADER_BYTES + node * size_of::<Node>() + node::LOCATION_BYTES * usize::from(offset)..]
     }
 
     /// The number of the child brick that a node refers to.
@@ -175,7 +175,7 @@ impl<'a> Brick<'a> {
 
     /// The index of the node that a node refers to.
     pub fn child_node(&self, node: usize, offset: u16) -> usize {
-        node + 8 * usize::from(offset) / size_of::<Node>()
+        node + node::LOCATION_BYTES * usize::from(offset) / size_of::<Node>()
     }
 
     fn u32_at(&self, at: usize) -> u32 {
@@ -199,7 +199,7 @@ pub fn brick_bytes(nodes: usize, children: usize, leaf_bytes: usize) -> usize {
 }
 
 /// Appends a brick to `out`. Children of `nodes` are given by index: nodes in `nodes`, bricks in `children`, leaves by
-/// their offset in `leaves` in units of 8 bytes; here they get the places where things come to lie.
+/// their offset in `leaves` in units of 4 bytes; here they get the places where things come to lie.
 ///
 /// # Panics
 /// When counts or bytes exceed [`NODES_MAX`], [`CHILDREN_MAX`] or [`BYTES_MAX`]: a builder's mistake.
@@ -216,12 +216,14 @@ pub fn assemble(
     let (table, first_leaf) = (table_offset(nodes.len()), leaves_offset(nodes.len(), children.len()));
     for (index, node) in nodes.iter_mut().enumerate() {
         let from = table_offset(index);
-        let distance = |at: usize| ((at - from) / 8) as u16;
+        let distance = |at: usize| ((at - from) / node::LOCATION_BYTES) as u16;
         for slot in 0..usize::from(node.count) {
             node.children[slot] = match node.child(slot).expect("a builder makes known children") {
                 Child::Node(child) => Child::Node(distance(table_offset(usize::from(child)))),
                 Child::Brick(child) => Child::Brick(distance(table + 8 * usize::from(child))),
-                Child::Leaf(offset) => Child::Leaf(distance(first_leaf + 8 * usize::from(offset))),
+                Child::Leaf(offset) => {
+                    Child::Leaf(distance(first_leaf + node::LOCATION_BYTES * usize::from(offset)))
+                }
             }
             .encode();
         }
@@ -271,8 +273,8 @@ mod tests {
             radii: [0.0; 2],
         };
         let mut leaves = Vec::new();
-        leaf::encode(&[face], 0, &mut leaves);
         let mut node = Node::over(&[face.bounds(), face.bounds()]);
+        leaf::encode(&[face], 0, node.child_box(0).min, &mut leaves);
         node.children[0] = Child::Leaf(0).encode();
         node.children[1] = Child::Brick(0).encode();
         let mut bytes = Vec::new();
@@ -317,10 +319,10 @@ mod tests {
         for child in [
             Child::Node(0),
             Child::Node(1),
-            Child::Node(16),
+            Child::Node(32),
             Child::Brick(0),
             Child::Leaf(0),
-            Child::Leaf(2000),
+            Child::Leaf(4000),
         ] {
             let (mut bytes, length) = small_brick();
             bytes[HEADER_BYTES + 16..HEADER_BYTES + 18].copy_from_slice(&child.encode().to_le_bytes());

@@ -4,7 +4,7 @@
 //! byte   0  origin      3 x i32   lattice coordinates of the lower corner
 //!       12  exponent    3 x u8    a box unit is 2^exponent lattice steps, per axis
 //!       15  count       u8        children, 0 to 8
-//!       16  children    8 x u16   kind in the top 2 bits, location in the lower 14: 8-byte units from
+//!       16  children    8 x u16   kind in the top 2 bits, location in the lower 14: 4-byte units from
 //!                                 the node's start
 //!       32  lower       3 x 8 u8  lower faces of the children's boxes, x of all, y of all, z of all
 //!       56  upper       3 x 8 u8  upper faces
@@ -23,7 +23,7 @@ pub const WIDTH: usize = 8;
 /// Bytes of a child's far field.
 pub const FAR_BYTES: usize = 6;
 
-/// What a child is, and where: in units of 8 bytes from the start of the node that refers to it, so that a walk needs
+/// What a child is, and where: in units of [`LOCATION_BYTES`] from the start of the node that refers to it, so that a walk needs
 /// nothing of a brick but the node it stands at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Child {
@@ -40,6 +40,8 @@ const KIND_LEAF: u16 = 1;
 const KIND_BRICK: u16 = 2;
 /// Bits of a child's location.
 pub const LOCATION_BITS: u32 = 14;
+/// Bytes of a unit of location.
+pub const LOCATION_BYTES: usize = 4;
 
 impl Child {
     /// The 16 bits stored in a node.
@@ -150,6 +152,14 @@ impl Node {
             }))
         };
         LatticeBox { min: corner(&self.lower), max: corner(&self.upper) }
+    }
+
+    /// The lower corner of [`child_box`](Self::child_box).
+    #[inline(always)]
+    pub fn lower_corner(&self, slot: usize) -> IVec3 {
+        IVec3::from_array(std::array::from_fn(|axis| {
+            self.origin[axis].wrapping_add(i32::from(self.lower[axis][slot]) << self.exponent[axis])
+        }))
     }
 
     /// What the child is; none for a kind that this version does not know.

@@ -11,8 +11,8 @@ use super::ALIGNMENT;
 use super::bundle::{Bundle, EXTINCTION_OPAQUE, RAYS_MAX};
 use super::intersect;
 use super::lanes::{Boxes, Corners, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
-use super::leaf::{self, Layout};
-use super::node::{Child, FAR_BYTES, LOCATION_BITS, Node, WIDTH};
+use super::leaf::{self, Kind, Layout};
+use super::node::{Child, FAR_BYTES, LOCATION_BITS, LOCATION_BYTES, Node, WIDTH};
 
 /// Where a brick is, for the current batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -96,14 +96,18 @@ pub struct Scratch {
 /// A node or leaf to visit, with its list of rays.
 #[derive(Clone, Copy, Debug)]
 struct Entry {
-    /// Byte address in units of 8.
-    address: u32,
-    is_leaf: bool,
+    /// Byte address of the node, or of the node that has the leaf as a child.
+    address: usize,
+    /// The leaf's place among the node's children; [`NO_LEAF`] for the node itself.
+    leaf: u16,
     /// Entries of the list.
     count: u16,
     /// First entry of the list.
     first: u32,
 }
+
+/// See [`Entry::leaf`].
+const NO_LEAF: u16 = u16::MAX;
 
 impl Scratch {
     /// Memory for bundles of [`RAYS_MAX`] rays.
@@ -227,7 +231,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         match bricks.locate(start) {
             Location::Resident(at) => walk.scratch.stack.push(Entry {
                 address: root_node(at),
-                is_leaf: false,
+                leaf: NO_LEAF,
                 count: count as u16,
                 first: 0,
             }),
@@ -248,9 +252,9 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             if count == 0 {
                 continue;
             }
-            if entry.is_leaf {
+            if entry.leaf != NO_LEAF {
                 // SAFETY: as the caller's
-                unsafe { walk.visit_leaf(entry.address, count) };
+                unsafe { walk.visit_leaf(entry.address, usize::from(entry.leaf), count) };
             } else {
                 // SAFETY: as the caller's
                 unsafe { walk.visit_node(entry, count) };
@@ -264,8 +268,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
     /// The instruction set of `L` is available.
     #[inline(always)]
     unsafe fn visit_node(&mut self, entry: Entry, count: usize) {
-        let at = 8 * entry.address as usize;
-        let node: &Node = bytemuck::from_bytes(&self.memory[at..at + size_of::<Node>()]);
+        let node = node_at(self.memory, entry.address);
         self.scratch.counts.nodes += 1;
         self.scratch.counts.node_rays += count as u64;
         let Scratch { current, masks, boxes, .. } = &mut *self.scratch;
@@ -282,7 +285,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             // A node or leaf that will be visited is asked for before the rays are tested
             let child = node.children[slot];
             if child >> LOCATION_BITS < 2 {
-                prefetch(self.memory, entry.address + u32::from(child & LOCATION_MASK));
+                prefetch(self.memory, entry.address + LOCATION_BYTES * usize::from(child & LOCATION_MASK));
             }
         }
 
@@ -329,11 +332,14 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
                 continue;
             }
             match targets[slot] {
-                Target::Open { address, is_leaf } => {
-                    if !is_leaf {
-                        prefetch(self.memory, address);
-                    }
-                    stack.push(Entry { address, is_leaf, count: met as u16, first: first as u32 });
+                Target::Node(address) => {
+                    prefetch(self.memory, address);
+                    stack.push(Entry { address, leaf: NO_LEAF, count: met as u16, first: first as u32 });
+                    first += met;
+                }
+                Target::Leaf => {
+                    let (address, leaf) = (entry.address, slot as u16);
+                    stack.push(Entry { address, leaf, count: met as u16, first: first as u32 });
                     first += met;
                 }
                 Target::Wait(brick) => {
@@ -349,17 +355,15 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
 
     /// What a child of the node at `address` asks for.
     #[inline(always)]
-    fn target(bricks: &B, memory: &[u8], address: u32, child: Option<Child>) -> Target {
+    fn target(bricks: &B, memory: &[u8], address: usize, child: Option<Child>) -> Target {
         match child {
-            Some(Child::Node(offset)) => {
-                Target::Open { address: address + u32::from(offset), is_leaf: false }
-            }
-            Some(Child::Leaf(offset)) => Target::Open { address: address + u32::from(offset), is_leaf: true },
+            Some(Child::Node(offset)) => Target::Node(address + LOCATION_BYTES * usize::from(offset)),
+            Some(Child::Leaf(_)) => Target::Leaf,
             Some(Child::Brick(offset)) => {
-                let at = 8 * (address as usize + usize::from(offset));
+                let at = address + LOCATION_BYTES * usize::from(offset);
                 let number = u32::from_le_bytes(memory[at..at + 4].try_into().expect("4 bytes"));
                 match bricks.locate(number) {
-                    Location::Resident(at) => Target::Open { address: root_node(at), is_leaf: false },
+                    Location::Resident(at) => Target::Node(root_node(at)),
                     Location::FarField => Target::FarField,
                     Location::Missing => Target::Wait(number),
                 }
@@ -391,17 +395,19 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         }
     }
 
-    /// Tests `count` rays against a leaf's faces.
+    /// Tests `count` rays against the faces of a node's leaf.
     ///
     /// # Safety
     /// The instruction set of `L` is available.
     #[inline(always)]
-    unsafe fn visit_leaf(&mut self, address: u32, count: usize) {
-        let bytes = &self.memory[8 * address as usize..];
-        let layout = Layout::read_trusted(bytes);
+    unsafe fn visit_leaf(&mut self, node: usize, slot: usize, count: usize) {
+        let parent = node_at(self.memory, node);
+        let address = node + LOCATION_BYTES * usize::from(parent.children[slot] & LOCATION_MASK);
+        let bytes = &self.memory[address..];
+        let layout = Layout::read_trusted(bytes, parent.lower_corner(slot));
         self.scratch.counts.leaves += 1;
         self.scratch.counts.leaf_rays += count as u64;
-        if layout.round {
+        if layout.kind == Kind::Round {
             self.visit_round_leaf(bytes, &layout, count);
             return;
         }
@@ -437,7 +443,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
                 if self.bundle.reach.is_finite() {
                     hits = within(&self.scratch.planes, &direction, hits, self.bundle.reach);
                 }
-                let mut faces = (hits | hits >> 8) as u8;
+                let mut faces = layout.kind.faces(hits);
                 if near && faces != 0 {
                     faces = self.retest(bytes, &layout, &origin, &direction, hits);
                 }
@@ -470,12 +476,12 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         origin: &super::bundle::Origin,
         direction: &[f32; 4],
         hits: u16,
-    ) -> u8 {
+    ) -> u16 {
         let close = within(&self.scratch.planes, direction, hits, self.bundle.near);
-        let close_faces = (close | close >> 8) as u8;
-        let mut faces = ((hits & !close) | (hits & !close) >> 8) as u8;
+        let close_faces = layout.kind.faces(close);
+        let mut faces = layout.kind.faces(hits & !close);
         let exact = Vec3::from_slice(&direction[..3]).as_dvec3();
-        for face in (0..8).filter(|face| close_faces >> face & 1 != 0) {
+        for face in (0..layout.faces).filter(|face| close_faces >> face & 1 != 0) {
             self.scratch.counts.retests += 1;
             let reach = f64::from(self.bundle.reach);
             if intersect::meets(&layout.face(leaf, face), origin.position, exact, reach) {
@@ -499,7 +505,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             let direction = Vec3::from_slice(&direction[..3]).as_dvec3();
             let mut faces = 0;
             for (face, decoded) in decoded[..layout.faces].iter().enumerate() {
-                faces |= u8::from(intersect::meets(decoded, position, direction, reach)) << face;
+                faces |= u16::from(intersect::meets(decoded, position, direction, reach)) << face;
             }
             if faces != 0 {
                 self.meet_faces(leaf, layout, ray, faces);
@@ -509,7 +515,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
 
     /// Adds the extinction of the faces in the mask to a ray.
     #[inline(always)]
-    fn meet_faces(&mut self, leaf: &[u8], layout: &Layout, ray: u16, mut faces: u8) {
+    fn meet_faces(&mut self, leaf: &[u8], layout: &Layout, ray: u16, mut faces: u16) {
         self.scratch.counts.hits += u64::from(faces.count_ones());
         let mut extinction = 0;
         if layout.opaque {
@@ -529,13 +535,10 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
 enum Target {
     /// Its far field stands in for it.
     FarField,
-    /// It is visited.
-    Open {
-        /// As in [`Entry`].
-        address: u32,
-        /// As in [`Entry`].
-        is_leaf: bool,
-    },
+    /// It is a node to visit, at this byte address.
+    Node(usize),
+    /// It is a leaf to visit.
+    Leaf,
     /// It is a brick that is not in memory.
     Wait(u32),
 }
@@ -546,19 +549,25 @@ fn face_extinction(stored: u16) -> u32 {
     if stored == leaf::OPAQUE { EXTINCTION_OPAQUE } else { u32::from(stored) }
 }
 
-/// The address of a brick's root node in units of 8 bytes, from the brick's in units of [`ALIGNMENT`].
+/// The byte address of a brick's root node, from the brick's in units of [`ALIGNMENT`].
 #[inline(always)]
-fn root_node(brick: u32) -> u32 {
-    brick * (ALIGNMENT / 8) as u32 + (super::HEADER_BYTES / 8) as u32
+fn root_node(brick: u32) -> usize {
+    brick as usize * ALIGNMENT + super::HEADER_BYTES
+}
+
+/// The node at a byte address.
+#[inline(always)]
+fn node_at(memory: &[u8], address: usize) -> &Node {
+    bytemuck::from_bytes(&memory[address..address + size_of::<Node>()])
 }
 
 /// Asks for the memory of a child that may be visited soon: the first two lines.
 #[inline(always)]
-fn prefetch(memory: &[u8], address: u32) {
+fn prefetch(memory: &[u8], address: usize) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        let at = memory.as_ptr().wrapping_add(8 * address as usize);
+        let at = memory.as_ptr().wrapping_add(address);
         // SAFETY: prefetching never faults, whatever the address
         unsafe {
             _mm_prefetch::<_MM_HINT_T0>(at.cast());
@@ -618,12 +627,16 @@ mod tests {
         let mut boxes = Vec::new();
         let mut bricks = Vec::new();
         for number in 1..=8 {
-            let (mut leaves, mut leaf_boxes, mut offsets) = (Vec::new(), Vec::new(), Vec::new());
+            let (mut leaves, mut leaf_faces, mut offsets) = (Vec::new(), Vec::new(), Vec::new());
             for leaf in 0..8 {
-                let round = leaf == 7;
-                let faces: Vec<Face> = (0..1 + random.next(8))
+                let (round, triangles) = (leaf == 7, leaf == 6);
+                let faces: Vec<Face> = (0..1 + random.next(if triangles { 10 } else { 8 }))
                     .map(|_| {
-                        let arity = (if round { 1 } else { 3 }) + random.next(2) as u8;
+                        let arity = match (round, triangles) {
+                            (true, _) => 1 + random.next(2) as u8,
+                            (_, true) => 3,
+                            _ => 3 + random.next(2) as u8,
+                        };
                         let center = random.vertex(extent);
                         let mut vertices = [center; 4];
                         for corner in 1..4 {
@@ -641,12 +654,16 @@ mod tests {
                         }
                     })
                     .collect();
-                offsets.push((leaves.len() / 8) as u16);
-                leaf::encode(&faces, 0, &mut leaves);
-                leaf_boxes.push(faces.iter().fold(LatticeBox::EMPTY, |b, f| b.union(f.bounds())));
+                leaf_faces.push(faces);
+            }
+            let bounds = |faces: &Vec<Face>| faces.iter().fold(LatticeBox::EMPTY, |b, f| b.union(f.bounds()));
+            let leaf_boxes: Vec<LatticeBox> = leaf_faces.iter().map(bounds).collect();
+            let mut node = Node::over(&leaf_boxes);
+            for (slot, faces) in leaf_faces.into_iter().enumerate() {
+                offsets.push((leaves.len() / LOCATION_BYTES) as u16);
+                leaf::encode(&faces, 0, node.lower_corner(slot), &mut leaves);
                 all.extend(faces);
             }
-            let mut node = Node::over(&leaf_boxes);
             (0..8).for_each(|slot| node.children[slot] = Child::Leaf(offsets[slot]).encode());
             boxes.push(leaf_boxes.iter().fold(LatticeBox::EMPTY, |b, &l| b.union(l)));
             let mut brick = Vec::new();

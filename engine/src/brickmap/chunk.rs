@@ -162,14 +162,9 @@ impl Chunk {
         }
         let (mut extinctions, offset) = ([0; FACES_MAX], self.leaves.len());
         faces.iter().zip(&mut extinctions).for_each(|(face, extinction)| *extinction = face.extinction);
-        leaf::encode_tile(
-            &vertices[..count],
-            across,
-            &extinctions[..faces.len()],
-            grid.shift,
-            &mut self.leaves,
-        );
-        self.record(faces, offset);
+        let (extinctions, bounds) = (&extinctions[..faces.len()], bounds(faces));
+        leaf::encode_tile(&vertices[..count], across, extinctions, grid.shift, bounds.min, &mut self.leaves);
+        self.record(faces, bounds, offset);
     }
 
     /// Cuts faces into leaves by balanced splits at multiples of eight along the longest axis.
@@ -223,15 +218,15 @@ impl Chunk {
     /// Encodes a leaf.
     fn push(&mut self, faces: &[Face], shift: u8) {
         let offset = self.leaves.len();
-        leaf::encode(faces, shift, &mut self.leaves);
-        self.record(faces, offset);
+        let bounds = bounds(faces);
+        leaf::encode(faces, shift, bounds.min, &mut self.leaves);
+        self.record(faces, bounds, offset);
     }
 
     /// Notes the leaf that was encoded from `offset` on.
-    fn record(&mut self, faces: &[Face], offset: usize) {
-        let (mut bounds, mut area, mut opaque_area) = (LatticeBox::EMPTY, 0.0, 0.0);
+    fn record(&mut self, faces: &[Face], bounds: LatticeBox, offset: usize) {
+        let (mut area, mut opaque_area) = (0.0, 0.0);
         for face in faces {
-            bounds = bounds.union(face.bounds());
             let face_area = super::farfield::area(face);
             area += face_area;
             opaque_area += face_area * super::farfield::opacity(face.extinction);
@@ -244,6 +239,11 @@ impl Chunk {
             content: Content::Leaf { offset: offset as u32, bytes: (self.leaves.len() - offset) as u32 },
         });
     }
+}
+
+/// The box of a leaf's faces; until the leaf is packed, it is encoded relative to this box's lower corner.
+fn bounds(faces: &[Face]) -> LatticeBox {
+    faces.iter().fold(LatticeBox::EMPTY, |bounds, face| bounds.union(face.bounds()))
 }
 
 /// Quads across and down of a tile of eight, or fewer, that is nearly square and fills the grid well.

@@ -26,7 +26,7 @@ use crate::math::Bounds;
 use crate::{Error, ErrorKind, Result};
 
 /// The version of bricks and map. Others are refused.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
 const SEGMENT_BYTES: u64 = 1 << 30;
 const LENGTH_BITS: u32 = 12;

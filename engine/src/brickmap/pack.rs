@@ -6,8 +6,8 @@
 
 use super::bvh::{WideChild, WideTree};
 use super::farfield;
-use crate::brick::node::WIDTH;
-use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble};
+use crate::brick::node::{LOCATION_BYTES, WIDTH};
+use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble, leaf};
 
 /// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
 /// larger ones load what a batch does not touch.
@@ -225,10 +225,11 @@ impl Packer<'_> {
                         let primitive = &self.primitives[primitive as usize];
                         match primitive.content {
                             Content::Leaf { offset, bytes } => {
-                                let here = (leaves.len() / 8) as u16;
-                                leaves.extend_from_slice(
-                                    &self.leaves[offset as usize..(offset + bytes) as usize],
-                                );
+                                let here = (leaves.len() / LOCATION_BYTES) as u16;
+                                let leaf = &self.leaves[offset as usize..(offset + bytes) as usize];
+                                // A leaf belongs to its box as the node has it
+                                let corner = node.child_box(slot).min;
+                                leaf::rebase(leaf, primitive.bounds.min, corner, &mut leaves);
                                 micropolygons += primitive.micropolygons as u32;
                                 Child::Leaf(here)
                             }

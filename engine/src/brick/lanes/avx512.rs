@@ -10,7 +10,7 @@ use glam::{IVec3, Vec3};
 use super::plain::{BOX_ERROR, Plain};
 use super::{Boxes, Corners, Lanes, Planes, SLACK};
 use crate::brick::bundle::{BoxRay, RAYS_MAX};
-use crate::brick::leaf::{HEADER_BYTES, Layout};
+use crate::brick::leaf::{HEADER_BYTES, Kind, Layout};
 use crate::brick::node::Node;
 
 /// The loops for AVX-512 F, BW, DQ, VL, VBMI and VBMI2.
@@ -139,7 +139,7 @@ impl Lanes for Avx512 {
             return unsafe { Plain::corners(leaf, layout, reference, out) };
         }
         debug_assert!(leaf.len() >= layout.bytes + crate::brick::leaf::READ_PAST_BYTES);
-        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 20 bytes from byte 20,
+        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 40 bytes from byte 4,
         // and 16 coordinates start within the leaf
         unsafe {
             // Unpack the vertices relative to the reference
@@ -158,35 +158,11 @@ impl Lanes for Avx512 {
                 }
             }
 
-            // Read the corners' indices, 8 faces at a time
-            let indices = leaf.as_ptr().add(HEADER_BYTES);
-            let corner: [__m256i; 4] = if layout.columns > 0 {
-                let face = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
-                // face / columns for up to 8 of each, by multiplication
-                let inverse = _mm256_set1_epi32(256_i32.div_euclid(layout.columns as i32) + 1);
-                let row = _mm256_srli_epi32::<8>(_mm256_mullo_epi32(face, inverse));
-                let first = _mm256_add_epi32(face, row);
-                let wide = layout.columns as i32 + 1;
-                [
-                    first,
-                    _mm256_add_epi32(first, _mm256_set1_epi32(1)),
-                    _mm256_add_epi32(first, _mm256_set1_epi32(wide + 1)),
-                    _mm256_add_epi32(first, _mm256_set1_epi32(wide)),
-                ]
+            let lanes = if layout.kind == Kind::Tile {
+                tile_lanes(layout.columns)
             } else {
-                let bits = layout.index_bits as i64;
-                let shifts =
-                    _mm512_mullo_epi64(_mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0), _mm512_set1_epi64(bits));
-                let mask = _mm512_set1_epi64((1 << bits) - 1);
-                let mut corner = [_mm256_setzero_si256(); 4];
-                for (c, corner) in corner.iter_mut().enumerate() {
-                    let word = indices.add(c * layout.index_bits).cast::<i64>().read_unaligned();
-                    let spread = _mm512_srlv_epi64(_mm512_set1_epi64(word), shifts);
-                    *corner = _mm512_cvtepi64_epi32(_mm512_and_si512(spread, mask));
-                }
-                corner
+                index_lanes(leaf, layout)
             };
-            let lanes = [pair(corner[0], corner[0]), pair(corner[1], corner[2]), pair(corner[2], corner[3])];
 
             // Gather the corners
             for axis in 0..3 {
@@ -200,7 +176,8 @@ impl Lanes for Avx512 {
                 }
             }
             let present = ((1_u32 << layout.faces) - 1) as u16;
-            out.present = present | present << 8;
+            out.quads = layout.kind != Kind::Triangles;
+            out.present = if out.quads { present | present << 8 } else { present };
         }
     }
 
@@ -221,7 +198,8 @@ impl Lanes for Avx512 {
                 }
                 touches |= at_origin;
             }
-            let mut valid = source.present & !(touches | touches >> 8 | touches << 8);
+            let excluded = if source.quads { touches | touches >> 8 | touches << 8 } else { touches };
+            let mut valid = source.present & !excluded;
 
             // Make the planes; products are not fused, see the plain version
             let [a, b, c] = corners;
@@ -258,6 +236,41 @@ impl Lanes for Avx512 {
     }
 }
 
+/// The vertices of a tile's triangles, per corner.
+#[inline(always)]
+unsafe fn tile_lanes(columns: usize) -> [__m512i; 3] {
+    // SAFETY: no memory is touched
+    unsafe {
+        let face = _mm512_set_epi32(7, 6, 5, 4, 3, 2, 1, 0, 7, 6, 5, 4, 3, 2, 1, 0);
+        // face / columns for up to 8 of each, by multiplication
+        let inverse = _mm512_set1_epi32(256 / columns as i32 + 1);
+        let row = _mm512_srli_epi32::<8>(_mm512_mullo_epi32(face, inverse));
+        let first = _mm512_add_epi32(face, row);
+        let wide = columns as i32 + 1;
+        let second = _mm512_mask_set1_epi32(_mm512_set1_epi32(1), 0xff00, wide + 1);
+        let third = _mm512_mask_set1_epi32(_mm512_set1_epi32(wide + 1), 0xff00, wide);
+        [first, _mm512_add_epi32(first, second), _mm512_add_epi32(first, third)]
+    }
+}
+
+/// The vertices of a leaf's triangles, per corner.
+#[inline(always)]
+unsafe fn index_lanes(leaf: &[u8], layout: &Layout) -> [__m512i; 3] {
+    // SAFETY: the caller's leaf may be read 64 bytes past its end
+    unsafe {
+        let indices = leaf.as_ptr().add(HEADER_BYTES);
+        let mut column = [_mm512_setzero_si512(); 4];
+        for (corner, column) in column.iter_mut().enumerate().take(layout.kind.corners()) {
+            let packed = indices.add(corner * layout.index_bytes);
+            *column = unpack(packed, layout.index_bits as u8);
+        }
+        if layout.kind == Kind::Triangles {
+            return [column[0], column[1], column[2]];
+        }
+        [pair(column[0], column[0]), pair(column[1], column[2]), pair(column[2], column[3])]
+    }
+}
+
 /// The 16 numbers of `bits` bits that start at `packed`.
 #[inline(always)]
 unsafe fn unpack(packed: *const u8, bits: u8) -> __m512i {
@@ -286,11 +299,11 @@ unsafe fn widen(bytes: &[u8; 8]) -> __m256 {
     unsafe { _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(bytes.as_ptr().cast()))) }
 }
 
-/// Two halves of 8 lanes.
+/// The lower halves of both.
 #[inline(always)]
-unsafe fn pair(low: __m256i, high: __m256i) -> __m512i {
+unsafe fn pair(low: __m512i, high: __m512i) -> __m512i {
     // SAFETY: no memory is touched
-    unsafe { _mm512_inserti64x4::<1>(_mm512_castsi256_si512(low), high) }
+    unsafe { _mm512_shuffle_i64x2::<0b01_00_01_00>(low, high) }
 }
 
 /// A component of the cross product; products are not fused.

@@ -31,7 +31,7 @@ pub struct Boxes {
 }
 
 /// Corners of a leaf's triangles relative to a bundle's reference, in lattice steps: lanes 0 to 7 have the first triangles of
-/// faces 0 to 7, lanes 8 to 15 the second ones.
+/// quads 0 to 7, lanes 8 to 15 the second ones; or each lane has a triangle of its own.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 pub struct Corners {
@@ -39,11 +39,13 @@ pub struct Corners {
     pub coordinates: [[[i32; 16]; 3]; 3],
     /// Lanes that hold a triangle.
     pub present: u16,
+    /// Whether lanes 0 to 7 and 8 to 15 are the two triangles of quads.
+    pub quads: bool,
 }
 
 impl Corners {
     /// No triangles.
-    pub const EMPTY: Self = Self { coordinates: [[[0; 16]; 3]; 3], present: 0 };
+    pub const EMPTY: Self = Self { coordinates: [[[0; 16]; 3]; 3], present: 0, quads: true };
 }
 
 /// Triangles of a leaf, seen from one origin, in the same lanes.

@@ -4,7 +4,7 @@ use glam::{IVec3, Vec3};
 
 use super::{Boxes, Corners, Lanes, Planes};
 use crate::brick::bundle::{BoxRay, RAYS_MAX};
-use crate::brick::leaf::{FACES_MAX, Layout, VERTICES_MAX};
+use crate::brick::leaf::{FACES_MAX, Kind, Layout, VERTICES_MAX};
 use crate::brick::node::{Node, WIDTH};
 
 /// The plain loops.
@@ -91,6 +91,18 @@ impl Lanes for Plain {
                 vertices[axis][vertex] = position[axis].wrapping_sub(reference[axis]);
             }
         }
+        if layout.kind == Kind::Triangles {
+            for face in 0..layout.faces.min(16) {
+                for corner in 0..3 {
+                    let index = layout.index(leaf, face, corner) % VERTICES_MAX;
+                    for axis in 0..3 {
+                        out.coordinates[corner][axis][face] = vertices[axis][index];
+                    }
+                }
+            }
+            (out.present, out.quads) = (((1_u32 << layout.faces) - 1) as u16, false);
+            return;
+        }
         for face in 0..FACES_MAX.min(layout.faces) {
             let indices = [0, 1, 2, 3].map(|corner| layout.index(leaf, face, corner) % VERTICES_MAX);
             for axis in 0..3 {
@@ -101,7 +113,7 @@ impl Lanes for Plain {
             }
         }
         let present = ((1_u32 << layout.faces) - 1) as u16;
-        out.present = present | present << 8;
+        (out.present, out.quads) = (present | present << 8, true);
     }
 
     #[inline(always)]
@@ -120,7 +132,7 @@ impl Lanes for Plain {
             touches |= at_origin;
         }
         // Both triangles of a quad are left out
-        let excluded = touches | touches >> 8 | touches << 8;
+        let excluded = if source.quads { touches | touches >> 8 | touches << 8 } else { touches };
         let [a, b, c] = &corners;
         let edges = [[a, b], [b, c], [c, a]];
         // Products are not fused: both faces of an edge get the same numbers with opposite signs
