@@ -7,20 +7,20 @@ use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::folder::write_atomically;
-use crate::import::{GridSink, ImportOptions, ImportReport, import, is_importable};
+use crate::import::{ImportOptions, ImportReport, Part, Parts, SavedParts, import_parts, is_importable};
 use crate::scene::instances::InstanceReader;
 use crate::scene::{Geometry, Instances, Scene, StreamSource};
 use crate::stream::adapt::{Concat, Convert, Instance, MatrixSource};
-use crate::stream::file::{MgsReader, MgsWriter};
+use crate::stream::file::MgsReader;
 use crate::stream::procedural::ProceduralStream;
-use crate::stream::{Microgrid, MicrogridStream, Schema};
+use crate::stream::MicrogridStream;
 use crate::{Error, Result};
 
 /// A scene whose files are all microgrid streams.
 #[derive(Debug)]
 pub struct Inputs {
-    /// Per geometry and stream: the .mgs file to read, none for procedural streams.
-    files: Vec<Vec<Option<PathBuf>>>,
+    /// Per geometry and stream: the .mgs files to read, none for procedural streams.
+    files: Vec<Vec<Option<Parts>>>,
     /// Per geometry, a hash of everything its stream's bytes depend on.
     pub identities: Vec<u128>,
     /// What the imports reported.
@@ -31,14 +31,13 @@ pub struct Inputs {
 #[derive(Serialize, Deserialize)]
 struct Saved {
     version: u32,
-    /// Relative to the folder where they were imported into it.
-    files: Vec<Vec<Option<PathBuf>>>,
+    files: Vec<Vec<Option<SavedParts>>>,
     /// In hexadecimal.
     identities: Vec<String>,
 }
 
 const SAVED_FILE: &str = "inputs.json";
-const SAVED_VERSION: u32 = 1;
+const SAVED_VERSION: u32 = 2;
 
 impl Inputs {
     /// Imports the files of `scene` that are no microgrid streams into `folder`, and hashes everything.
@@ -51,10 +50,16 @@ impl Inputs {
         memory_bytes: u64,
         progress: &mut dyn FnMut(f64) -> Result<()>,
     ) -> Result<Self> {
-        let options = ImportOptions { meters_per_unit: scene.meters_per_unit, up: scene.up, memory_bytes };
+        let options = ImportOptions {
+            meters_per_unit: scene.meters_per_unit,
+            up: scene.up,
+            memory_bytes,
+            frame: scene.frame.map(|frame| frame as f64),
+            ..ImportOptions::default()
+        };
         let total: usize = scene.geometries.iter().map(|geometry| geometry.streams.len()).sum();
         let mut inputs = Self { files: Vec::new(), identities: Vec::new(), reports: Vec::new() };
-        let mut imported: Vec<(PathBuf, PathBuf)> = Vec::new();
+        let mut imported: Vec<(PathBuf, Parts)> = Vec::new();
         let mut done = 0;
         for geometry in &scene.geometries {
             let mut hash = Xxh3::new();
@@ -64,26 +69,31 @@ impl Inputs {
             for source in &geometry.streams {
                 progress(done as f64 / total as f64)?;
                 done += 1;
-                let file = match source {
+                let parts = match source {
                     StreamSource::Procedural(parameters) => {
                         hash.update(format!("{parameters:?}").as_bytes());
                         hash.update(env!("CARGO_PKG_VERSION").as_bytes());
                         files.push(None);
                         continue;
                     }
-                    StreamSource::File(path) if !is_importable(path) => path.clone(),
+                    StreamSource::File(path) if !is_importable(path) => Parts {
+                        parts: vec![Part { file: path.clone(), copies: None }],
+                        metadata: MgsReader::open(path)?.metadata().to_vec(),
+                    },
                     StreamSource::File(path) => match imported.iter().find(|(from, _)| from == path) {
-                        Some((_, to)) => to.clone(),
+                        Some((_, parts)) => parts.clone(),
                         None => {
-                            let to = folder.join(format!("{}.mgs", imported.len()));
-                            inputs.reports.push((path.clone(), import_file(path, &to, &options)?));
-                            imported.push((path.clone(), to.clone()));
-                            to
+                            let target = folder.join(format!("{}.mgs", imported.len()));
+                            let mut watch = || progress(done as f64 / total as f64);
+                            let (parts, report) = import_parts(path, &target, &options, &mut watch)?;
+                            inputs.reports.push((path.clone(), report));
+                            imported.push((path.clone(), parts.clone()));
+                            parts
                         }
                     },
                 };
-                hash_file(&file, &mut hash)?;
-                files.push(Some(file));
+                hash_parts(&parts, &mut hash)?;
+                files.push(Some(parts));
             }
             for instances in &geometry.instances {
                 match instances {
@@ -102,8 +112,8 @@ impl Inputs {
     /// # Errors
     /// When it cannot be written.
     pub fn save(&self, folder: &Path) -> Result<()> {
-        let relative = |file: &PathBuf| file.strip_prefix(folder).unwrap_or(file).to_path_buf();
-        let files = self.files.iter().map(|files| files.iter().map(|f| f.as_ref().map(relative)).collect());
+        let saved = |parts: &Option<Parts>| parts.as_ref().map(|parts| parts.save(folder));
+        let files = self.files.iter().map(|files| files.iter().map(saved).collect());
         let identities = self.identities.iter().map(|identity| format!("{identity:032x}"));
         let saved =
             Saved { version: SAVED_VERSION, files: files.collect(), identities: identities.collect() };
@@ -129,9 +139,20 @@ impl Inputs {
         {
             return Err(damaged());
         }
-        let absolute = |file: PathBuf| folder.join(file);
-        let files = saved.files.into_iter().map(|files| files.into_iter().map(|f| f.map(absolute)).collect());
-        Ok(Self { files: files.collect(), identities, reports: Vec::new() })
+        let parts = |saved: Option<SavedParts>| match saved {
+            Some(saved) => Parts::load(saved, folder).map(Some).ok_or_else(damaged),
+            None => Ok(None),
+        };
+        let files = saved.files.into_iter().map(|files| files.into_iter().map(parts).collect());
+        Ok(Self { files: files.collect::<Result<_>>()?, identities, reports: Vec::new() })
+    }
+
+    /// What a geometry's file says about itself: nothing where it has several, or copies of its own.
+    pub fn metadata(&self, scene: &Scene, geometry: usize) -> &[(String, String)] {
+        match &self.files[geometry][..] {
+            [Some(only)] if scene.geometries[geometry].instances.is_empty() => &only.metadata,
+            _ => &[],
+        }
     }
 
     /// The stream of a geometry in the scene's units and axes, instances expanded.
@@ -146,8 +167,8 @@ impl Inputs {
                 (StreamSource::Procedural(parameters), _) => {
                     Box::new(ProceduralStream::new(parameters, scene.meters_per_unit, scene.up)?)
                 }
-                (_, Some(file)) => {
-                    Box::new(Convert::to_units(MgsReader::open(file)?, scene.meters_per_unit, scene.up)?)
+                (_, Some(parts)) => {
+                    Box::new(Convert::to_units(parts.open()?, scene.meters_per_unit, scene.up)?)
                 }
                 (StreamSource::File(path), None) => {
                     return Err(Error::invalid("the file was not imported").at(path));
@@ -162,37 +183,6 @@ impl Inputs {
             return Ok(stream);
         }
         Ok(Box::new(Instance::new(stream, Matrices::new(instances))?))
-    }
-}
-
-/// Imports one file into a microgrid stream beside nothing else: the target appears when it is complete.
-///
-/// # Errors
-/// See [`import`].
-pub fn import_file(path: &Path, target: &Path, options: &ImportOptions) -> Result<ImportReport> {
-    let mut sink = FileSink { target, writer: None };
-    let report = import(path, options, &mut sink)?;
-    match sink.writer {
-        Some(writer) if report.grids > 0 => writer.finish()?,
-        _ => return Err(Error::invalid("the file holds no geometry").at(path)),
-    };
-    Ok(report)
-}
-
-/// Writes imported grids to a microgrid stream.
-struct FileSink<'a> {
-    target: &'a Path,
-    writer: Option<MgsWriter>,
-}
-
-impl GridSink for FileSink<'_> {
-    fn begin(&mut self, schema: &Schema) -> Result<()> {
-        self.writer = Some(MgsWriter::create(self.target, schema, &[])?);
-        Ok(())
-    }
-
-    fn grid(&mut self, grid: &Microgrid) -> Result<()> {
-        self.writer.as_mut().ok_or_else(|| Error::invalid("a grid before the schema"))?.write(grid)
     }
 }
 
@@ -231,6 +221,17 @@ impl MatrixSource for Matrices {
             }
         }
     }
+}
+
+/// Adds files, and where they stand, to a hash.
+fn hash_parts(parts: &Parts, hash: &mut Xxh3) -> Result<()> {
+    for Part { file, copies } in &parts.parts {
+        hash_file(file, hash)?;
+        if let Some(copies) = copies {
+            copies.each_use(|matrix| hash.update(bytemuck::cast_slice(&matrix.to_cols_array())));
+        }
+    }
+    Ok(())
 }
 
 /// Adds a file's content to a hash.

@@ -201,6 +201,10 @@ impl<'a> SetBake<'a> {
             metadata.push((of("domain"), format!("{:?}", shader.domain).to_lowercase()));
             metadata.push((of("weight"), format!("{:?}", shader.weight).to_lowercase()));
         }
+        let own = self.inputs.metadata(self.scene, self.geometry).iter();
+        let own: Vec<_> =
+            own.filter(|(key, _)| metadata.iter().all(|(known, _)| known != key)).cloned().collect();
+        metadata.extend(own);
         metadata
     }
 }

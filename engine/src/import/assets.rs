@@ -1,4 +1,4 @@
-//! Tests on real files: every PLY, OBJ and glTF of the asset folder has the counts and the box of its inventory.
+//! Tests on real files: every PLY, OBJ, glTF and USD file of the asset folder has the counts and the box of its inventory.
 
 use std::path::{Path, PathBuf};
 
@@ -12,15 +12,24 @@ use crate::stream::schema::names;
 #[derive(Default)]
 pub(super) struct Collect {
     pub schema: Schema,
+    pub metadata: Vec<(String, String)>,
+    /// Where the prototypes begin in `grids`, and how they are placed.
+    pub copies: Vec<(usize, Copies)>,
     pub grids: Vec<Microgrid>,
     pub begun: usize,
 }
 
 impl GridSink for Collect {
-    fn begin(&mut self, schema: &Schema) -> Result<()> {
+    fn begin(&mut self, schema: &Schema, metadata: &[(String, String)]) -> Result<()> {
         schema.validate()?;
+        self.metadata = metadata.to_vec();
         self.schema = schema.clone();
         self.begun += 1;
+        Ok(())
+    }
+
+    fn copies(&mut self, copies: &Copies) -> Result<()> {
+        self.copies.push((self.grids.len(), copies.clone()));
         Ok(())
     }
 
@@ -150,6 +159,9 @@ fn compare(listed: &Listed, sink: &Collect, report: &ImportReport) -> Vec<String
     check("lines", source.lines, lines);
     check("points", source.points, points);
     let dropped: u64 = report.skipped.iter().map(|skip| skip.1).sum();
+    if let Some(units) = sink.metadata.iter().find(|(key, _)| key == "usd.metersPerUnit") {
+        return failures.into_iter().chain(compare_box(listed, sink, units.1.parse().unwrap())).collect();
+    }
     if ngons == 0 {
         let faces = source.triangles + source.quads + source.lines + source.points;
         check("faces after import", report.micropolygons + dropped, faces);
@@ -171,6 +183,35 @@ fn compare(listed: &Listed, sink: &Collect, report: &ImportReport) -> Vec<String
         }
     }
     failures
+}
+
+/// Whether a USD file's box lies in the one listed, in the file's own units. That one is a box about the transformed boxes
+/// of prims, or what they claim to be their extent.
+fn compare_box(listed: &Listed, sink: &Collect, meters_per_unit: f64) -> Option<String> {
+    use crate::stream::adapt::MatrixSource;
+    let Some(expected) = listed.bounds else { return None };
+    let (mut found, mut rotated) = (Bounds::EMPTY, Bounds::EMPTY);
+    let end = |i: usize| sink.copies.get(i).map_or(sink.grids.len(), |(start, _)| *start);
+    let mut add = |p: DVec3| {
+        found.add(p / meters_per_unit);
+        // Stages with +z up are listed as they stand
+        rotated.add(DVec3::new(p.x, -p.z, p.y) / meters_per_unit);
+    };
+    let vertices = |grid: &Microgrid| (0..grid.vertex_count()).map(|v| grid.position(v)).collect::<Vec<_>>();
+    sink.grids[..end(0)].iter().flat_map(vertices).for_each(&mut add);
+    for (i, (start, copies)) in sink.copies.iter().enumerate() {
+        let prototype: Vec<DVec3> = sink.grids[*start..end(i + 1)].iter().flat_map(vertices).collect();
+        let mut copies = copies.clone();
+        while let Some(matrix) = copies.next().unwrap() {
+            prototype.iter().for_each(|&p| add(matrix.transform_point3(p)));
+        }
+    }
+    let largest = expected.min.abs().max(expected.max.abs()).max_element();
+    let outside = |b: &Bounds| (expected.min - b.min).max(b.max - expected.max).max_element().max(0.0);
+    let off = if found.is_empty() { 0.0 } else { outside(&found).min(outside(&rotated)) };
+    // Files that test readers with wrong extents
+    let lies = listed.path.contains("/extent/");
+    (!lies && off > 1e-5 * largest).then(|| format!("{}: box {found:?}, {expected:?} listed", listed.path))
 }
 
 /// Catches coordinates millions of units from the origin that lose their decimals, or differ between grids.

@@ -45,6 +45,7 @@ impl Clusters {
 pub(super) struct VertexKey {
     position_normal: u64,
     material_opacity: u64,
+    variant: u32,
 }
 
 impl VertexKey {
@@ -55,12 +56,14 @@ impl VertexKey {
         Self {
             position_normal: position | u64::from(mesh.normal_index(corner)),
             material_opacity: u64::from(face.material) << 32 | u64::from(face.opacity) << 1 | thin,
+            variant: mesh.variant(corner).unwrap_or(0),
         }
     }
 
     fn hash(&self) -> usize {
-        let mixed =
-            (self.position_normal ^ self.material_opacity.rotate_left(17)) ^ self.position_normal >> 29;
+        let variant = u64::from(self.variant).wrapping_mul(0xd6e8_feb8_6659_fd93);
+        let mixed = self.position_normal ^ self.material_opacity.rotate_left(17) ^ variant;
+        let mixed = mixed ^ self.position_normal >> 29;
         (mixed.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 48) as usize
     }
 }
@@ -76,7 +79,7 @@ pub(super) struct VertexTable {
 impl VertexTable {
     /// A table for at most [`FACES_TARGET`] faces of 4 corners, or 256 points.
     pub fn new() -> Self {
-        let empty = VertexKey { position_normal: 0, material_opacity: 0 };
+        let empty = VertexKey { position_normal: 0, material_opacity: 0, variant: 0 };
         Self { slots: vec![(0, 0, empty); 2048], stamp: 0, count: 0 }
     }
 
@@ -455,7 +458,11 @@ mod tests {
         eprintln!("{faces} faces, {} clusters: {:.2} M faces/s", clusters.ends.len(), faces / seconds / 1e6);
         struct Null;
         impl crate::import::GridSink for Null {
-            fn begin(&mut self, _: &crate::stream::Schema) -> crate::Result<()> {
+            fn begin(&mut self, _: &crate::stream::Schema, _: &[(String, String)]) -> crate::Result<()> {
+                Ok(())
+            }
+
+            fn copies(&mut self, _: &crate::import::Copies) -> crate::Result<()> {
                 Ok(())
             }
             fn grid(&mut self, _: &crate::stream::Microgrid) -> crate::Result<()> {

@@ -14,7 +14,7 @@ use crate::stream::schema::names;
 use crate::stream::{Attribute, Microgrid, Schema, ValueType};
 
 /// Which attributes a stream carries, decided before its first grid.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Carried {
     /// `N`.
     pub normal: bool,
@@ -24,6 +24,10 @@ pub(super) struct Carried {
     pub opacity: bool,
     /// `radius`.
     pub radius: bool,
+    /// Further attributes of f32 per vertex, in the order of [`Mesh::extras`].
+    pub extras: Vec<Attribute>,
+    /// `point`.
+    pub point: bool,
 }
 
 impl Carried {
@@ -34,19 +38,25 @@ impl Carried {
             albedo: !mesh.colors.is_empty() || !mesh.palette.is_empty(),
             opacity: mesh.has_opacity(),
             radius: mesh.has_radii(),
+            ..Self::default()
         }
     }
 
-    /// The attributes in their order: `N albedo opacity radius id`.
-    fn attributes(self) -> Vec<Attribute> {
-        let all = [
+    /// The attributes in their order: `N albedo opacity radius`, further ones, `point id`.
+    fn attributes(&self) -> Vec<Attribute> {
+        let first = [
             (self.normal, Attribute::vertex(names::NORMAL, ValueType::F32, 3)),
             (self.albedo, Attribute::vertex(names::ALBEDO, ValueType::U8, 3)),
             (self.opacity, Attribute::vertex(names::OPACITY, ValueType::U8, 1)),
             (self.radius, Attribute::vertex(names::RADIUS, ValueType::F32, 1)),
+        ];
+        let last = [
+            (self.point, Attribute::vertex(names::POINT, ValueType::U32, 1)),
             (true, Attribute::grid(names::ID, ValueType::U32, 1)),
         ];
-        all.into_iter().filter(|(carried, _)| *carried).map(|(_, attribute)| attribute).collect()
+        let wanted = |(carried, attribute): (bool, Attribute)| carried.then_some(attribute);
+        let first = first.into_iter().filter_map(wanted).chain(self.extras.iter().cloned());
+        first.chain(last.into_iter().filter_map(wanted)).collect()
     }
 }
 
@@ -126,13 +136,23 @@ const EXPONENT_MIN: i16 = -200;
 impl<'a> Emitter<'a> {
     /// Begins a stream.
     pub fn new(sink: &'a mut dyn GridSink, carried: Carried, options: &super::ImportOptions) -> Result<Self> {
+        Self::with_metadata(sink, carried, options, &[])
+    }
+
+    /// Begins a stream that says `metadata` about itself.
+    pub fn with_metadata(
+        sink: &'a mut dyn GridSink,
+        carried: Carried,
+        options: &super::ImportOptions,
+        metadata: &[(String, String)],
+    ) -> Result<Self> {
         let schema = Schema {
             meters_per_unit: options.meters_per_unit,
             up: options.up,
             attributes: carried.attributes(),
         };
         schema.validate()?;
-        sink.begin(&schema)?;
+        sink.begin(&schema, metadata)?;
         Ok(Self {
             sink,
             schema,
@@ -142,6 +162,11 @@ impl<'a> Emitter<'a> {
             exponents: Vec::new(),
             points: Vec::new(),
         })
+    }
+
+    /// Ends what stands in the world: grids that follow are a prototype's.
+    pub fn copies(&mut self, copies: &super::Copies) -> Result<()> {
+        self.sink.copies(copies)
     }
 
     /// Writes a copy of a mesh. Faces carry their object's number as `id`, from `first_id`.
@@ -223,6 +248,7 @@ impl<'a> Emitter<'a> {
 
     fn push_vertex(&mut self, mesh: &Mesh, face: &Face, corner: usize, placement: &Placement, radius: f32) {
         let position = mesh.corners[corner] as usize;
+        let variant = mesh.variant(corner);
         let mut point = placement.point(mesh.positions[position]);
         if let Some(&exponent) = self.exponents.get(position) {
             let step = power_of_two(exponent);
@@ -238,12 +264,14 @@ impl<'a> Emitter<'a> {
             }
         }
         if let Some(column) = next(self.carried.albedo) {
+            let variant = variant.and_then(|variant| mesh.variant_colors.get(variant as usize));
             let from_palette = || mesh.palette.get(face.material as usize).copied().unwrap_or(ALBEDO_DEFAULT);
-            let albedo = mesh.colors.get(position).copied().unwrap_or_else(from_palette);
+            let albedo = variant.or_else(|| mesh.colors.get(position)).copied().unwrap_or_else(from_palette);
             self.grid.columns[column].extend_from_slice(&albedo);
         }
         if let Some(column) = next(self.carried.opacity) {
-            let opacity = mesh.opacities.get(position).copied().unwrap_or(face.opacity);
+            let variant = variant.and_then(|variant| mesh.variant_opacities.get(variant as usize));
+            let opacity = variant.or_else(|| mesh.opacities.get(position)).copied().unwrap_or(face.opacity);
             self.grid.columns[column].push(opacity);
         }
         if let Some(column) = next(self.carried.radius) {
@@ -254,6 +282,19 @@ impl<'a> Emitter<'a> {
             };
             let radius = (own * placement.scale) as f32;
             self.grid.columns[column].extend_from_slice(&radius.to_le_bytes());
+        }
+        for (i, attribute) in self.carried.extras.iter().enumerate() {
+            let value = mesh.extras.get(i).and_then(|extra| extra.at(position, variant));
+            let column = &mut self.grid.columns[column + i];
+            match value {
+                Some(value) => column.extend(value.iter().flat_map(|value| value.to_le_bytes())),
+                None => column.resize(column.len() + attribute.value_bytes(), 0),
+            }
+        }
+        if self.carried.point {
+            let number = mesh.point_numbers.get(position).copied().unwrap_or(position as u32);
+            let column = &mut self.grid.columns[column + self.carried.extras.len()];
+            column.extend_from_slice(&number.to_le_bytes());
         }
     }
 

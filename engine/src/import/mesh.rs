@@ -41,6 +41,16 @@ pub(super) struct Mesh {
     pub opacities: Vec<u8>,
     /// Radius per position; may be empty.
     pub radii: Vec<f32>,
+    /// Per corner the row of what differs between the corners of a position; empty when nothing does.
+    pub corner_variants: Vec<u32>,
+    /// Linear albedo per variant, which goes before that of positions; may be empty.
+    pub variant_colors: Vec<[u8; 3]>,
+    /// Opacity per variant, which goes before that of positions; may be empty.
+    pub variant_opacities: Vec<u8>,
+    /// Values of the stream's further attributes, in their order; may be empty.
+    pub extras: Vec<Extra>,
+    /// Per position its number in the file; empty when that is its index.
+    pub point_numbers: Vec<u32>,
     /// Position indices of all faces.
     pub corners: Vec<u32>,
     /// The faces.
@@ -51,6 +61,42 @@ pub(super) struct Mesh {
     pub smooth: Vec<Vec3>,
     /// Whether every position is exactly a single precision number.
     pub single_precision: bool,
+}
+
+/// Values of an attribute that the engine hands on without reading it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Extra {
+    /// Numbers of a value.
+    pub components: usize,
+    /// What a value belongs to.
+    pub rate: ExtraRate,
+    /// The values, one after the other. Where one is missing, it is zero.
+    pub values: Vec<f32>,
+}
+
+/// What each value of an [`Extra`] belongs to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) enum ExtraRate {
+    /// The mesh.
+    #[default]
+    Constant,
+    /// A position.
+    Position,
+    /// A variant, see [`Mesh::corner_variants`].
+    Variant,
+}
+
+impl Extra {
+    /// The value at a corner of the given position and variant.
+    pub fn at(&self, position: usize, variant: Option<u32>) -> Option<&[f32]> {
+        let row = match self.rate {
+            ExtraRate::Constant => 0,
+            ExtraRate::Position => position,
+            ExtraRate::Variant => variant? as usize,
+        };
+        let value = self.values.get(row * self.components..(row + 1) * self.components)?;
+        (!value.is_empty()).then_some(value)
+    }
 }
 
 impl Mesh {
@@ -98,6 +144,11 @@ impl Mesh {
         }
     }
 
+    /// The variant of a corner, if corners have any.
+    pub fn variant(&self, corner: usize) -> Option<u32> {
+        self.corner_variants.get(corner).copied()
+    }
+
     /// Whether vertices have normals: those of the file, or those of faces that have an area.
     pub fn has_normals(&self) -> bool {
         !self.normals.is_empty() || self.faces.iter().any(|face| face.arity > 2)
@@ -110,7 +161,7 @@ impl Mesh {
 
     /// Whether any vertex lets light through.
     pub fn has_opacity(&self) -> bool {
-        self.opacities.iter().any(|&opacity| opacity < 255)
+        self.opacities.iter().chain(&self.variant_opacities).any(|&opacity| opacity < 255)
             || self.faces.iter().any(|face| face.opacity < 255)
     }
 
@@ -177,8 +228,10 @@ impl Mesh {
     /// Makes corner `first` of a face its first one.
     fn rotate_face(&mut self, start: usize, arity: usize, first: usize) {
         self.corners[start..start + arity].rotate_left(first);
-        if !self.corner_normals.is_empty() {
-            self.corner_normals[start..start + arity].rotate_left(first);
+        for parallel in [&mut self.corner_normals, &mut self.corner_variants] {
+            if !parallel.is_empty() {
+                parallel[start..start + arity].rotate_left(first);
+            }
         }
     }
 
@@ -209,8 +262,10 @@ impl Mesh {
             }
             for &i in triangle {
                 self.corners.push(corners[i as usize]);
-                if !self.corner_normals.is_empty() {
-                    self.corner_normals.push(self.corner_normals[start + i as usize]);
+                for parallel in [&mut self.corner_normals, &mut self.corner_variants] {
+                    if !parallel.is_empty() {
+                        parallel.push(parallel[start + i as usize]);
+                    }
                 }
             }
             kept.push(Face { start: new_start, arity: 3, ..*face });

@@ -1,10 +1,11 @@
-//! Import: PLY, OBJ and glTF become compact microgrids, handed to a sink one by one (`docs/import.md`).
+//! Import: PLY, OBJ, glTF and USD become compact microgrids, handed to a sink one by one (`docs/import.md`).
 //!
 //! Each format leaves an indexed `mesh` in memory; `polygon` turns what has more than four corners into
 //! triangles, `cut` parts the faces into clusters of at most 256 vertices, `emit` writes them out as microgrids.
 //! Nothing is allocated because a file says so: lengths are checked against the file's size, and the memory that a
 //! file needs is computed and compared with [`ImportOptions::memory_bytes`] before it is taken.
 
+mod assembly;
 mod budget;
 mod confine;
 mod cut;
@@ -13,10 +14,12 @@ mod gltf;
 mod lines;
 mod mesh;
 mod obj;
+mod parts;
 mod ply;
 mod polygon;
 mod radius;
 mod srgb;
+mod usd;
 
 #[cfg(test)]
 mod assets;
@@ -25,16 +28,25 @@ mod hostile;
 
 use std::path::Path;
 
+pub use self::assembly::Copies;
+pub use self::parts::{Part, Parts, SavedParts, import_parts};
 use crate::stream::{Microgrid, Schema, schema::UpAxis};
 use crate::{Error, Result};
 
 /// Receives an imported stream: the schema once, then every grid in order.
 pub trait GridSink {
-    /// Learns the attributes and the space of the grids that follow.
+    /// Learns the attributes and the space of the grids that follow, and what the file says about itself.
     ///
     /// # Errors
     /// When the sink cannot take such a stream; the import stops with this error.
-    fn begin(&mut self, schema: &Schema) -> Result<()>;
+    fn begin(&mut self, schema: &Schema, metadata: &[(String, String)]) -> Result<()>;
+
+    /// The grids that follow stand once for each of `copies`, until the next call; those before the first call stand
+    /// once, where they are.
+    ///
+    /// # Errors
+    /// When the sink cannot take it; the import stops with this error.
+    fn copies(&mut self, copies: &Copies) -> Result<()>;
 
     /// Takes the next grid. The memory stays with the caller.
     ///
@@ -53,11 +65,21 @@ pub struct ImportOptions {
     pub up: UpAxis,
     /// What the import may hold in memory at once, in bytes.
     pub memory_bytes: u64,
+    /// The time code at which USD is read; none takes default values.
+    pub frame: Option<f64>,
+    /// Seconds that may pass until a USD file yields its next prim: a broken one may take for ever.
+    pub patience_seconds: u64,
 }
 
 impl Default for ImportOptions {
     fn default() -> Self {
-        Self { meters_per_unit: 1.0, up: UpAxis::Y, memory_bytes: 1 << 30 }
+        Self {
+            meters_per_unit: 1.0,
+            up: UpAxis::Y,
+            memory_bytes: 1 << 30,
+            frame: None,
+            patience_seconds: 300,
+        }
     }
 }
 
@@ -124,6 +146,7 @@ enum Format {
     Ply,
     Obj,
     Gltf,
+    Usd,
 }
 
 impl Format {
@@ -133,12 +156,16 @@ impl Format {
             "ply" => Some(Self::Ply),
             "obj" => Some(Self::Obj),
             "gltf" | "glb" => Some(Self::Gltf),
+            "usd" | "usda" | "usdc" | "usdz" => Some(Self::Usd),
             _ => None,
         }
     }
 }
 
-/// Whether [`import`] reads files of this name: `.ply`, `.obj`, `.gltf` or `.glb`, in any case.
+/// The names of files that are read.
+pub const EXTENSIONS: [&str; 8] = ["ply", "obj", "gltf", "glb", "usd", "usda", "usdc", "usdz"];
+
+/// Whether [`import`] reads files of this name: one of [`EXTENSIONS`], in any case.
 pub fn is_importable(path: &Path) -> bool {
     Format::of(path).is_some()
 }
@@ -152,9 +179,10 @@ pub fn is_importable(path: &Path) -> bool {
 /// file, and whatever the sink returns. Grids handed over before an error are valid, but not all there are.
 pub fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {
     let Some(format) = Format::of(path) else {
-        return Err(Error::unsupported("this is not a format that can be imported")
-            .at(path)
-            .hint("files of these names are read: .ply .obj .gltf .glb"));
+        return Err(Error::unsupported("this is not a format that can be imported").at(path).hint(format!(
+            "files of these names are read: {}",
+            EXTENSIONS.map(|e| format!(".{e}")).join(" ")
+        )));
     };
     if !(options.meters_per_unit.is_finite() && options.meters_per_unit > 0.0) {
         return Err(Error::invalid(format!(
@@ -166,6 +194,7 @@ pub fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> 
         Format::Ply => ply::import(path, options, sink),
         Format::Obj => obj::import(path, options, sink),
         Format::Gltf => gltf::import(path, options, sink),
+        Format::Usd => usd::import(path, options, sink),
     }
     .map_err(|error| error.at(path))?;
     if report.micropolygons == 0 {

@@ -9,9 +9,8 @@ use crate::error::nearest;
 use crate::{ErrorKind, Result};
 
 /// Types of files that a stream can come from.
-pub(super) const STREAM_TYPES: [&str; 5] = ["mgs", "ply", "obj", "gltf", "glb"];
-/// Types that the grammar declares and this version cannot read.
-pub(super) const STREAM_TYPES_LATER: [&str; 4] = ["usd", "usda", "usdc", "usdz"];
+pub(super) const STREAM_TYPES: [&str; 9] =
+    ["mgs", "ply", "obj", "gltf", "glb", "usd", "usda", "usdc", "usdz"];
 /// Digits of a frame number at most, in a pattern.
 const FRAME_DIGITS_MAX: usize = 9;
 /// Entries of a folder to look at, at most, for a name like the one that is missing.
@@ -35,10 +34,6 @@ impl Files<'_> {
     pub fn stream(&self, value: &Value<'_>) -> Result<PathBuf> {
         let path = self.resolve(value)?;
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        if STREAM_TYPES_LATER.contains(&&*extension) {
-            let message = format!("streams from USD files (`.{extension}`) are not supported yet");
-            return Err(value.error(ErrorKind::Unsupported, message).hint("export it as glTF, OBJ or PLY"));
-        }
         if !STREAM_TYPES.contains(&&*extension) {
             let known = STREAM_TYPES.map(|known| format!("`.{known}`")).join(", ");
             let message = match extension.as_str() {

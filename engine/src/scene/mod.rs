@@ -103,6 +103,8 @@ fn not_utf8(path: &Path, bytes: &[u8], error: std::str::Utf8Error) -> Error {
 pub struct Scene {
     /// The file it was read from.
     pub path: PathBuf,
+    /// The frame that it was read for.
+    pub frame: Option<i64>,
     /// Metres per scene unit.
     pub meters_per_unit: f64,
     /// Which axis points up.
@@ -210,7 +212,7 @@ pub struct Geometry {
 /// Where microgrids come from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum StreamSource {
-    /// A file: .mgs, .ply, .obj, .gltf or .glb.
+    /// A file: .mgs, or one that is imported.
     File(PathBuf),
     /// A generator.
     Procedural(Procedural),

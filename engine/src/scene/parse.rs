@@ -53,7 +53,8 @@ pub(super) fn scene(document: &Document<'_>, frame: Option<i64>, roots: Option<&
         return Err(root.error(ErrorKind::Invalid, message));
     }
     let geometries = elements.iter().map(|&element| declared.geometry(element)).collect::<Result<_>>()?;
-    Ok(Scene { path: document.path.to_path_buf(), meters_per_unit, up, cameras, shaders, geometries })
+    let path = document.path.to_path_buf();
+    Ok(Scene { path, frame, meters_per_unit, up, cameras, shaders, geometries })
 }
 
 /// Checks the root's name and version before anything else: another version may have another grammar.

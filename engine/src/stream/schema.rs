@@ -72,8 +72,8 @@ impl Attribute {
 /// Names of the attributes that the engine itself reads.
 ///
 /// `N` is the unit normal (3 components), `radius` the radius of points and lines in scene units, `opacity` from 0
-/// to 1, `albedo` and `radiance` linear RGB, `id` the identity of the object, `instance` the copy's number. Positions
-/// (`P`) are not an attribute: every grid has them.
+/// to 1, `albedo` and `radiance` linear RGB, `id` the identity of the object, `instance` the copy's number, `point` that
+/// of the point in its file. Positions (`P`) are not an attribute: every grid has them.
 pub mod names {
     /// Unit normal, 3 components.
     pub const NORMAL: &str = "N";
@@ -89,6 +89,8 @@ pub mod names {
     pub const ID: &str = "id";
     /// Number of the copy in an instanced geometry, u32.
     pub const INSTANCE: &str = "instance";
+    /// Number of the point in the object of the imported file, u32; 4,294,967,295 where there is none.
+    pub const POINT: &str = "point";
     /// Set to 1 on points that a partial bake computed, u8.
     pub const BAKED: &str = "baked";
 }
@@ -163,7 +165,12 @@ impl Schema {
             }
             let expected = match name.as_str() {
                 names::NORMAL | names::ALBEDO | names::RADIANCE => 3,
-                names::RADIUS | names::OPACITY | names::ID | names::INSTANCE | names::BAKED => 1,
+                names::RADIUS
+                | names::OPACITY
+                | names::ID
+                | names::INSTANCE
+                | names::POINT
+                | names::BAKED => 1,
                 _ => attribute.components,
             };
             if attribute.components != expected {

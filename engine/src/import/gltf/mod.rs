@@ -26,6 +26,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let mut container = Container::open(path, options.memory_bytes)?;
     let copies = nodes::copies(&mut container, options, &mut report)?;
     let carried = carried(&container, &copies);
+    let with_albedo = carried.albedo;
     let mut emitter = Emitter::new(sink, carried, options)?;
     let mut images = texture::Images::default();
     for (&mesh, places) in &copies {
@@ -34,7 +35,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
         }
         for index in 0..container.document.meshes[mesh].primitives.len() {
             let mut own = ImportReport::default();
-            let read = primitive::read(&mut container, (mesh, index), &mut images, carried.albedo, &mut own)?;
+            let read = primitive::read(&mut container, (mesh, index), &mut images, with_albedo, &mut own)?;
             add_copies(&mut report, &own, places.len() as u64);
             let Some((mesh, bytes)) = read else { continue };
             let clusters = cut::cut(&mesh);

@@ -67,6 +67,7 @@ fn a_whole_scene_is_read() {
         |kind, seed, micropolygons| vec![StreamSource::Procedural(Procedural { kind, seed, micropolygons })];
     let expected = Scene {
         path: "folder/s.xml".into(),
+        frame: None,
         meters_per_unit: 0.01,
         up: UpAxis::Z,
         cameras: vec![Camera {

@@ -205,13 +205,6 @@ fn what_is_not_supported_yet_is_refused() {
         let hint = "";
         check(from, to, ErrorKind::Unsupported, message, hint);
     }
-    for extension in ["usd", "usda", "USDC", "usdz"] {
-        let file = format!("file=\"«no/such.{extension}\"");
-        let message =
-            format!("streams from USD files (`.{}`) are not supported yet", extension.to_lowercase());
-        let from = "procedural=\"jungle\" micropolygons=\"1000\"";
-        check(from, &file, ErrorKind::Unsupported, &message, "export it as glTF, OBJ or PLY");
-    }
     check_invalid(
         r#"
 <attribute | <filter type="«backfase"/><attribute | unknown filter type `backfase` | did you mean `backface`?

@@ -1,0 +1,190 @@
+//! Mesh prims: points, polygons, normals.
+
+use std::collections::HashMap;
+
+use glam::Vec3;
+
+use super::dress::{Elements, dress};
+use super::primvar::{self, Interpolation, Primvar, Values};
+use super::read::{Geometry, Stage};
+use super::value;
+use super::walk::Prim;
+use crate::import::mesh::{Face, Mesh, NO_NORMAL};
+use crate::stream::Attribute;
+use crate::{Error, ErrorKind, Result};
+
+const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+
+/// Reads a mesh.
+pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
+    let path = prim.path.as_str();
+    let mut geometry = Geometry::default();
+    let Geometry { mesh, report } = &mut geometry;
+    let points = stage.value(path, "points");
+    let counts = stage.integers(path, "faceVertexCounts").unwrap_or_default();
+    let indices = stage.integers(path, "faceVertexIndices").unwrap_or_default();
+    mesh.single_precision = matches!(points, Some(openusd::sdf::Value::Vec3fVec(_)));
+    if let Some(points) = points {
+        mesh.positions =
+            value::vectors(&points).ok_or_else(|| stage.broken(path, "`points` is no array of vectors"))?;
+    }
+    report.source.vertices = mesh.positions.len() as u64;
+    check(stage, path, mesh, &counts, &indices, attributes)?;
+
+    // Faces, in the order of their front
+    let is_left_handed =
+        stage.text(path, "orientation").is_some_and(|orientation| orientation == "leftHanded");
+    let holes = stage.integers(path, "holeIndices").unwrap_or_default();
+    let mut corner_sources = Vec::with_capacity(indices.len());
+    let mut corners = Vec::new();
+    let mut next = 0_u32;
+    for (number, &count) in counts.iter().enumerate() {
+        let range = next..next + count as u32;
+        next = range.end;
+        if count < 3 {
+            report.skip("faces of fewer than three corners", 1);
+            continue;
+        }
+        if holes.binary_search(&(number as i64)).is_ok() || holes.contains(&(number as i64)) {
+            report.skip("faces that are holes", 1);
+            continue;
+        }
+        corners.clear();
+        corners.extend(range);
+        if is_left_handed {
+            corners[1..].reverse();
+        }
+        corner_sources.extend(corners.iter().map(|&corner| (number as u32, corner)));
+        corners.iter_mut().for_each(|corner| *corner = indices[*corner as usize] as u32);
+        mesh.push_face(FACE, &corners, report)?;
+    }
+    let scheme = stage.text(path, "subdivisionScheme").unwrap_or_else(|| "catmullClark".into());
+    if scheme == "loop" {
+        report.skip("Loop subdivision surfaces, which are read as their polygons", 1);
+    }
+    let elements = Elements {
+        faces: counts.len(),
+        points: mesh.positions.len(),
+        corners: indices.len(),
+        corner_sources: &corner_sources,
+    };
+    // The normals of a cage are not those of the surface it stands for
+    if scheme == "none" || scheme == "bilinear" {
+        push_normals(stage, prim, &elements, mesh);
+    }
+    dress(stage, prim, attributes, &elements, &Some, mesh, report);
+    Ok(geometry)
+}
+
+/// Refuses a mesh whose numbers do not fit together, or that needs more memory than allowed.
+fn check(
+    stage: &Stage,
+    path: &str,
+    mesh: &Mesh,
+    counts: &[i64],
+    indices: &[i64],
+    attributes: &[Attribute],
+) -> Result<()> {
+    let points = mesh.positions.len();
+    let mut corners = 0_i64;
+    for (face, &count) in counts.iter().enumerate() {
+        if !(0..=i64::from(u32::MAX)).contains(&count) {
+            return Err(stage.broken(path, format!("face {face} has {count} corners")));
+        }
+        corners += count;
+    }
+    if corners != indices.len() as i64 {
+        let found = indices.len();
+        return Err(
+            stage.broken(path, format!("`faceVertexIndices` has {found} corners, {corners} expected"))
+        );
+    }
+    if let Some(corner) = indices.iter().position(|&index| !(0..points as i64).contains(&index)) {
+        let index = indices[corner];
+        return Err(stage.broken(path, format!("corner {corner} is point {index} of {points} points")));
+    }
+    need_memory(stage, path, points, indices.len(), counts.len(), attributes)
+}
+
+/// Refuses what would not fit.
+pub(super) fn need_memory(
+    stage: &Stage,
+    path: &str,
+    points: usize,
+    corners: usize,
+    faces: usize,
+    attributes: &[Attribute],
+) -> Result<()> {
+    let values: u64 = attributes.iter().map(|attribute| attribute.value_bytes() as u64).sum();
+    let bytes =
+        Mesh::bytes(points as u64, corners as u64, faces as u64) + (corners.max(points) as u64) * values;
+    if bytes > stage.memory_bytes {
+        let (need, have) = (bytes.div_ceil(1 << 20), stage.memory_bytes >> 20);
+        let message = format!("prim `{path}` takes {need} MiB, {have} MiB are allowed");
+        return Err(Error::new(ErrorKind::Limit, message)
+            .at(&stage.path)
+            .hint("allow more memory (`--memory`), or cut the prim into parts"));
+    }
+    Ok(())
+}
+
+/// Gives a mesh the normals that are written, where there is one for each element.
+fn push_normals(stage: &Stage, prim: &Prim, elements: &Elements<'_>, mesh: &mut Mesh) {
+    let Some(found) = normals(stage, prim) else { return };
+    let vector = |value: &[f32]| Vec3::from_slice(value);
+    let per_corner = |number: &dyn Fn(u32, u32) -> u32| {
+        elements.corner_sources.iter().map(|&(face, corner)| number(face, corner)).collect()
+    };
+    match found.interpolation {
+        Interpolation::Vertex | Interpolation::Varying if found.len() >= elements.points => {
+            mesh.normals = found.expand(elements.points).chunks_exact(3).map(vector).collect();
+        }
+        Interpolation::Uniform if found.len() >= elements.faces => {
+            mesh.normals = found.expand(elements.faces).chunks_exact(3).map(vector).collect();
+            mesh.corner_normals = per_corner(&|face, _| face);
+        }
+        Interpolation::FaceVarying if found.len() >= elements.corners => {
+            // Corners with equal normals share a vertex
+            let mut known: HashMap<[u32; 3], u32> = HashMap::new();
+            let values = found.expand(elements.corners);
+            let mut numbers = Vec::with_capacity(elements.corners);
+            for value in values.chunks_exact(3) {
+                let next = mesh.normals.len() as u32;
+                let number = *known.entry([0, 1, 2].map(|i| value[i].to_bits())).or_insert(next);
+                if number == next {
+                    mesh.normals.push(vector(value));
+                }
+                numbers.push(if vector(value) == Vec3::ZERO { NO_NORMAL } else { number });
+            }
+            mesh.corner_normals = per_corner(&|_, corner| numbers[corner as usize]);
+        }
+        Interpolation::Constant => {
+            mesh.normals = vec![vector(&found.expand(1))];
+            mesh.corner_normals = per_corner(&|_, _| 0);
+        }
+        _ => {}
+    }
+}
+
+/// The normals that a prim has written: as a primvar, or else as `normals`.
+pub(super) fn normals(stage: &Stage, prim: &Prim) -> Option<Values> {
+    let primvar = prim.primvars.iter().find(|primvar| primvar.name == "normals" && primvar.components == 3);
+    if let Some(found) = primvar.and_then(|primvar| primvar::read(stage, primvar)) {
+        return Some(found);
+    }
+    plain(stage, &prim.path, "normals", 3)
+}
+
+/// An attribute with an interpolation that is no primvar: `normals`, `widths`.
+pub(super) fn plain(stage: &Stage, path: &str, name: &str, components: usize) -> Option<Values> {
+    let values: Vec<f32> = stage.numbers(path, name)?.iter().map(|&x| x as f32).collect();
+    let token = stage.field(path, name, "interpolation").and_then(|value| value::text(&value));
+    let interpolation = token.and_then(|token| primvar::parse(&token)).unwrap_or(Interpolation::Vertex);
+    let fits = !values.is_empty() && values.len().is_multiple_of(components);
+    fits.then_some(Values { interpolation, components, values, indices: None })
+}
+
+/// Whether a prim has a primvar of this name.
+pub(super) fn primvar_named<'a>(prim: &'a Prim, name: &str) -> Option<&'a Primvar> {
+    prim.primvars.iter().find(|primvar| primvar.name == name && primvar.components == 1)
+}

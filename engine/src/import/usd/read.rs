@@ -1,0 +1,107 @@
+//! The composed stage: values at the frame that is imported, and prims as meshes.
+
+use std::path::{Path, PathBuf};
+
+use openusd::sdf::Value;
+use openusd::usd::{self, TimeCode};
+
+use super::fence::Stop;
+use super::guard::Guard;
+use super::walk::{Kind, Prim};
+use super::{curves, points, polygons};
+use crate::import::ImportOptions;
+use crate::import::ImportReport;
+use crate::import::mesh::Mesh;
+use crate::stream::Attribute;
+use crate::{Error, ErrorKind, Result};
+
+/// A prim as a mesh, in its own space.
+#[derive(Debug, Default)]
+pub(super) struct Geometry {
+    /// Faces, lines and points; not finished.
+    pub mesh: Mesh,
+    /// What was counted and left out.
+    pub report: ImportReport,
+}
+
+/// An open file.
+pub(super) struct Stage {
+    /// The library's stage. It lives in the thread that reads.
+    pub stage: usd::Stage,
+    /// The file.
+    pub path: PathBuf,
+    /// What may be held at once, in bytes.
+    pub memory_bytes: u64,
+    /// Metres per unit of the scene, and its up axis.
+    pub options: ImportOptions,
+    frame: Option<f64>,
+}
+
+impl Stage {
+    /// Opens a file with everything it is made of.
+    pub fn open(path: &Path, options: &ImportOptions, stop: Stop) -> Result<Self> {
+        // The library's own error for a file that is not there names no reason
+        std::fs::File::open(path).map_err(|error| Error::io("open the file", path, error))?;
+        let name = path.to_str().ok_or_else(|| Error::invalid("a path that is not UTF-8").at(path))?;
+        // What layers hold is decoded as they are opened: about twice their size on disk and more
+        let guard = Guard::new(path.to_path_buf(), options.memory_bytes / 2, stop);
+        let stage = usd::Stage::builder().resolver(guard).open(name).map_err(|error| {
+            Error::new(ErrorKind::Corrupt, format!("not a USD file that can be read: {error:#}")).at(path)
+        })?;
+        Ok(Self {
+            stage,
+            path: path.to_path_buf(),
+            memory_bytes: options.memory_bytes,
+            options: options.clone(),
+            frame: options.frame,
+        })
+    }
+
+    /// The value of an attribute at the frame; without one its default, or else its first sample.
+    pub fn value(&self, prim: &str, attribute: &str) -> Option<Value> {
+        let attribute = self.stage.attribute(format!("{prim}.{attribute}"));
+        let at = |time: Option<TimeCode>| match attribute.get_at::<Value>(time).ok().flatten() {
+            Some(Value::None | Value::ValueBlock) | None => None,
+            Some(value) => Some(value),
+        };
+        match self.frame {
+            Some(frame) => at(Some(TimeCode::new(frame))),
+            None => at(None).or_else(|| at(Some(TimeCode::EARLIEST))),
+        }
+    }
+
+    /// A token or string.
+    pub fn text(&self, prim: &str, attribute: &str) -> Option<String> {
+        super::value::text(&self.value(prim, attribute)?)
+    }
+
+    /// Numbers of a scalar, tuple or array.
+    pub fn numbers(&self, prim: &str, attribute: &str) -> Option<Vec<f64>> {
+        super::value::numbers(&self.value(prim, attribute)?)
+    }
+
+    /// Whole numbers of an array.
+    pub fn integers(&self, prim: &str, attribute: &str) -> Option<Vec<i64>> {
+        super::value::integers(&self.value(prim, attribute)?)
+    }
+
+    /// A field of an attribute, such as `interpolation`.
+    pub fn field(&self, prim: &str, attribute: &str, field: &str) -> Option<Value> {
+        self.stage.attribute(format!("{prim}.{attribute}")).get_metadata::<Value>(field).ok().flatten()
+    }
+
+    /// Reads a prim; `attributes` are those that primvars become.
+    pub fn geometry(&self, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
+        let read = match prim.kind {
+            Kind::Mesh => polygons::read,
+            Kind::Points => points::read,
+            Kind::Curves => curves::read,
+        };
+        read(self, prim, attributes)
+    }
+
+    /// An error about a prim.
+    pub fn broken(&self, prim: &str, message: impl std::fmt::Display) -> Error {
+        Error::invalid(format!("prim `{prim}`: {message}")).at(&self.path)
+    }
+}
