@@ -10,10 +10,10 @@ use super::folder::write_atomically;
 use crate::import::{ImportOptions, ImportReport, Part, Parts, SavedParts, import_parts, is_importable};
 use crate::scene::instances::InstanceReader;
 use crate::scene::{Geometry, Instances, Scene, StreamSource};
+use crate::stream::MicrogridStream;
 use crate::stream::adapt::{Concat, Convert, Instance, MatrixSource};
 use crate::stream::file::MgsReader;
 use crate::stream::procedural::ProceduralStream;
-use crate::stream::MicrogridStream;
 use crate::{Error, Result};
 
 /// A scene whose files are all microgrid streams.

@@ -189,7 +189,7 @@ fn compare(listed: &Listed, sink: &Collect, report: &ImportReport) -> Vec<String
 /// of prims, or what they claim to be their extent.
 fn compare_box(listed: &Listed, sink: &Collect, meters_per_unit: f64) -> Option<String> {
     use crate::stream::adapt::MatrixSource;
-    let Some(expected) = listed.bounds else { return None };
+    let expected = listed.bounds?;
     let (mut found, mut rotated) = (Bounds::EMPTY, Bounds::EMPTY);
     let end = |i: usize| sink.copies.get(i).map_or(sink.grids.len(), |(start, _)| *start);
     let mut add = |p: DVec3| {

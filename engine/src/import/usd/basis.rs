@@ -35,7 +35,7 @@ impl Basis {
         match (self, wrap) {
             (Self::Linear, Wrap::Periodic) => (points >= 3).then_some(points),
             (Self::Linear, _) => (points >= 2).then(|| points - 1),
-            (Self::Bezier, Wrap::Periodic) => (points >= 3 && points.is_multiple_of(3)).then(|| points / 3),
+            (Self::Bezier, Wrap::Periodic) => (points >= 3 && points.is_multiple_of(3)).then_some(points / 3),
             (Self::Bezier, _) => (points >= 4 && points % 3 == 1).then(|| (points - 1) / 3),
             (_, Wrap::Periodic) => (points >= 3).then_some(points),
             (_, Wrap::Open) => (points >= 4).then(|| points - 3),

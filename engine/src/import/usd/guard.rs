@@ -71,7 +71,7 @@ impl Guard {
                         bytes.div_ceil(1 << 20)
                     ),
                 )
-                .at(path.to_path_buf())
+                .at(path)
                 .hint("allow more memory (`--memory`), or cut the file into parts"),
             ),
         }

@@ -83,7 +83,7 @@ fn own(stage: &Stage, prim: &str) -> Vec<Primvar> {
             let type_name = attribute.type_name().ok().flatten()?;
             let size = stage.field(prim, &format!("primvars:{name}"), "elementSize");
             let size = size.and_then(|value| value::numbers(&value)).map_or(1.0, |numbers| numbers[0]);
-            let size = if size >= 1.0 && size <= 4096.0 { size as usize } else { 1 };
+            let size = if (1.0..=4096.0).contains(&size) { size as usize } else { 1 };
             let components = value::components(type_name.as_str())? * size;
             Some(Primvar { name: name.into(), prim: prim.into(), components })
         })
