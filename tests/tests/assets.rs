@@ -4,10 +4,9 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use engine::bake::inputs::import_file;
 use engine::bake::{BakeOptions, Control, Quiet, bake};
 use engine::cut::Lod;
-use engine::import::ImportOptions;
+use engine::import::{ImportOptions, import_parts};
 use engine::scene;
 use engine::stats::Report;
 use engine::stream::file::{MgsReader, MgsWriter};
@@ -263,7 +262,8 @@ fn terrain_far_from_the_origin() {
     let near = Case::new("m", "z").expect("as before");
     let (source, moved) = (near.folder.path().join("far.mgs"), near.folder.path().join("near.mgs"));
     let options = ImportOptions { up: UpAxis::Z, ..ImportOptions::default() };
-    import_file(&near.assets.join("terrain_dem/terrain_far_quads.obj"), &source, &options).unwrap();
+    import_parts(&near.assets.join("terrain_dem/terrain_far_quads.obj"), &source, &options, &mut || Ok(()))
+        .unwrap();
     let mut reader = MgsReader::open(&source).unwrap();
     let mut writer = MgsWriter::create(&moved, reader.schema(), &[]).unwrap();
     let mut grid = Microgrid::default();
