@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use engine::bake::Control;
+use engine::dice::Rate;
 use engine::import::{EXTENSIONS, ImportOptions, ImportReport, Part, Parts, import_parts, is_importable};
+use engine::scene::Dice;
 use engine::stream::MicrogridStream;
 use engine::stream::adapt::{Concat, Convert};
 use engine::stream::file::MgsReader;
@@ -35,9 +37,12 @@ pub struct Arguments {
     /// The time code at which USD is read [default: its default values]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     frame: Option<f64>,
-    /// Known to the design, not to this version.
-    #[arg(long, hide = true)]
+    /// Dice faces, and subdivision surfaces on their limit, to edges of SIZE units, or of PIXELS (1) pixels of a camera
+    #[arg(long, value_name = "world:SIZE|camera:NAME[:PIXELS]")]
     dice: Option<String>,
+    /// The scene file whose camera `--dice` names
+    #[arg(long, value_name = "SCENE", requires = "dice")]
+    scene: Option<PathBuf>,
 }
 
 /// What was read and written.
@@ -64,16 +69,14 @@ struct Input {
 
 /// Imports and says what was read, left out and written.
 pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
-    let Arguments { inputs, output, space, memory, frame, dice } = arguments;
-    if dice.is_some() {
-        return Err(Error::unsupported("`--dice` is not supported yet")
-            .hint("leave it out: polygons become micropolygons as they are"));
-    }
+    let Arguments { inputs, output, space, memory, frame, dice, scene } = arguments;
+    let dice = dice.map(|dice| rate(&dice, scene.as_deref())).transpose()?;
     let options = ImportOptions {
         meters_per_unit: space.units,
         up: space.up.into(),
         memory_bytes: memory,
         frame,
+        dice,
         ..ImportOptions::default()
     };
     let inputs = import_all(&inputs, &output, &options, console.control())?;
@@ -87,6 +90,21 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
         output,
     };
     Answer::new(&imported, imported.describe())
+}
+
+/// How fine to dice, by a camera of a scene if one is named.
+fn rate(dice: &str, scene: Option<&Path>) -> Result<Rate> {
+    let dice = Dice::parse(dice)?;
+    let cameras = match (&dice, scene) {
+        (Dice::Camera { .. }, Some(scene)) => engine::scene::load(scene)?.cameras,
+        (Dice::Camera { .. }, None) => {
+            return Err(
+                Error::invalid("no scene says where the camera stands").hint("name one: `--scene SCENE`")
+            );
+        }
+        (Dice::World(_), _) => Vec::new(),
+    };
+    Rate::of(&dice, &cameras)
 }
 
 /// Imports each file beside the output, then joins what there is.

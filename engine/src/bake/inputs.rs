@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::folder::write_atomically;
+use crate::dice::Rate;
 use crate::import::{ImportOptions, ImportReport, Part, Parts, SavedParts, import_parts, is_importable};
 use crate::scene::instances::InstanceReader;
 use crate::scene::{Geometry, Instances, Scene, StreamSource};
@@ -59,7 +60,7 @@ impl Inputs {
         };
         let total: usize = scene.geometries.iter().map(|geometry| geometry.streams.len()).sum();
         let mut inputs = Self { files: Vec::new(), identities: Vec::new(), reports: Vec::new() };
-        let mut imported: Vec<(PathBuf, Parts)> = Vec::new();
+        let mut imported: Vec<(StreamSource, Parts)> = Vec::new();
         let mut done = 0;
         for geometry in &scene.geometries {
             let mut hash = Xxh3::new();
@@ -76,21 +77,26 @@ impl Inputs {
                         files.push(None);
                         continue;
                     }
-                    StreamSource::File(path) if !is_importable(path) => Parts {
+                    StreamSource::File(path, _) if !is_importable(path) => Parts {
                         parts: vec![Part { file: path.clone(), copies: None }],
                         metadata: MgsReader::open(path)?.metadata().to_vec(),
                     },
-                    StreamSource::File(path) => match imported.iter().find(|(from, _)| from == path) {
-                        Some((_, parts)) => parts.clone(),
-                        None => {
-                            let target = folder.join(format!("{}.mgs", imported.len()));
-                            let mut watch = || progress(done as f64 / total as f64);
-                            let (parts, report) = import_parts(path, &target, &options, &mut watch)?;
-                            inputs.reports.push((path.clone(), report));
-                            imported.push((path.clone(), parts.clone()));
-                            parts
+                    StreamSource::File(path, dice) => {
+                        match imported.iter().find(|(from, _)| from == source) {
+                            Some((_, parts)) => parts.clone(),
+                            None => {
+                                let target = folder.join(format!("{}.mgs", imported.len()));
+                                let mut watch = || progress(done as f64 / total as f64);
+                                let dice =
+                                    dice.as_ref().map(|dice| Rate::of(dice, &scene.cameras)).transpose()?;
+                                let options = ImportOptions { dice, ..options.clone() };
+                                let (parts, report) = import_parts(path, &target, &options, &mut watch)?;
+                                inputs.reports.push((path.clone(), report));
+                                imported.push((source.clone(), parts.clone()));
+                                parts
+                            }
                         }
-                    },
+                    }
                 };
                 hash_parts(&parts, &mut hash)?;
                 files.push(Some(parts));
@@ -170,7 +176,7 @@ impl Inputs {
                 (_, Some(parts)) => {
                     Box::new(Convert::to_units(parts.open()?, scene.meters_per_unit, scene.up)?)
                 }
-                (StreamSource::File(path), None) => {
+                (StreamSource::File(path, _), None) => {
                     return Err(Error::invalid("the file was not imported").at(path));
                 }
             });

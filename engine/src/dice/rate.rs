@@ -2,14 +2,11 @@
 
 use glam::{DMat4, DVec3};
 
-use crate::scene::Camera;
+use crate::scene::{Camera, Dice};
 use crate::{Error, Result};
 
 /// Segments of an edge are a power of two; this is the largest power.
 pub const LEVEL_MAX: u8 = 8;
-
-/// The default length of a micropolygon's edge, in pixels.
-pub const PIXELS: f64 = 1.0;
 
 /// How fine to dice.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,6 +31,18 @@ pub struct CameraRate {
 const NEAREST: f64 = 1e-6;
 
 impl Rate {
+    /// The rate that a scene or the command line asks for.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) for a camera that is not there.
+    pub fn of(dice: &Dice, cameras: &[Camera]) -> Result<Self> {
+        match (dice, dice.camera(cameras)?) {
+            (Dice::Camera { pixels, .. }, Some(camera)) => Self::camera(camera, *pixels),
+            (Dice::World(size), _) => Self::world(*size),
+            (Dice::Camera { name, .. }, None) => Err(Error::invalid(format!("no camera `{name}`"))),
+        }
+    }
+
     /// A rate of `size` scene units.
     ///
     /// # Errors

@@ -67,9 +67,9 @@ pub(super) struct Placement {
     /// Takes normals along: the cofactors, which are the inverse transpose up to a positive factor once the sign of
     /// the determinant is put right.
     world_from_normal: DMat3,
-    mirrored: bool,
+    pub mirrored: bool,
     /// Radii grow by this.
-    scale: f64,
+    pub scale: f64,
     identity: bool,
 }
 
@@ -103,11 +103,13 @@ impl Placement {
         })
     }
 
-    fn point(&self, point: DVec3) -> DVec3 {
+    /// Where a point stands.
+    pub fn point(&self, point: DVec3) -> DVec3 {
         if self.identity { point } else { self.world_from_mesh.transform_point3(point) }
     }
 
-    fn normal(&self, normal: Vec3) -> Vec3 {
+    /// A normal along with its face, of unit length.
+    pub fn normal(&self, normal: Vec3) -> Vec3 {
         if self.identity {
             return normal.normalize_or_zero();
         }
@@ -167,6 +169,22 @@ impl<'a> Emitter<'a> {
     /// Ends what stands in the world: grids that follow are a prototype's.
     pub fn copies(&mut self, copies: &super::Copies) -> Result<()> {
         self.sink.copies(copies)
+    }
+
+    /// Writes a copy of a mesh, diced if `rate` says how.
+    pub fn emit_diced(
+        &mut self,
+        mesh: &Mesh,
+        clusters: &Clusters,
+        placement: &Placement,
+        rate: Option<&crate::dice::Rate>,
+        ids: (u32, f32),
+        report: &mut ImportReport,
+    ) -> Result<()> {
+        match rate {
+            Some(rate) => super::diced::emit(self, mesh.clone(), placement, rate, ids, report),
+            None => self.emit(mesh, clusters, placement, ids, report),
+        }
     }
 
     /// Writes a copy of a mesh. Faces carry their object's number as `id`, from `first_id`.
@@ -313,7 +331,7 @@ impl<'a> Emitter<'a> {
 
 /// A corner's unit normal in world space: the file's, else the smooth one, else that of the face; zero for points and
 /// lines without one.
-fn corner_normal(mesh: &Mesh, face: &Face, corner: usize, placement: &Placement) -> Vec3 {
+pub(super) fn corner_normal(mesh: &Mesh, face: &Face, corner: usize, placement: &Placement) -> Vec3 {
     let position = mesh.corners[corner] as usize;
     let index = mesh.normal_index(corner);
     let given = if index == NO_NORMAL { mesh.smooth.get(position) } else { mesh.normals.get(index as usize) };
@@ -331,14 +349,14 @@ fn corner_normal(mesh: &Mesh, face: &Face, corner: usize, placement: &Placement)
 }
 
 /// The exponent of the finest power of two of which a box of this size holds at most 2^24 along an edge.
-fn resolution(size: f64) -> i16 {
+pub(super) fn resolution(size: f64) -> i16 {
     // The exponent of the next power of two, from the bits: the same on every machine
     let exponent = ((size.to_bits() >> 52) & 0x7ff) as i16 - 1023 + 1;
     (exponent - 24).max(EXPONENT_MIN)
 }
 
 /// 2 to an exponent of a normal number.
-fn power_of_two(exponent: i16) -> f64 {
+pub(super) fn power_of_two(exponent: i16) -> f64 {
     f64::from_bits(((i64::from(exponent) + 1023) as u64) << 52)
 }
 

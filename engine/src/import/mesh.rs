@@ -1,5 +1,7 @@
 //! An indexed mesh in memory, as every format leaves it for the cutter.
 
+use std::collections::HashMap;
+
 use glam::{DVec3, Vec3};
 
 use super::{ImportReport, polygon};
@@ -27,7 +29,7 @@ pub(super) struct Face {
 }
 
 /// Positions, faces over them, and what vertices carry.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Mesh {
     /// Vertex positions, in the file's own space.
     pub positions: Vec<DVec3>,
@@ -59,8 +61,21 @@ pub(super) struct Mesh {
     pub palette: Vec<[u8; 3]>,
     /// Area-weighted normal per position, from [`finish`](Self::finish); empty when no corner needs one.
     pub smooth: Vec<Vec3>,
+    /// The surface that the faces stand for, if not for themselves; only dicing heeds it.
+    pub subdivision: Option<Subdivision>,
     /// Whether every position is exactly a single precision number.
     pub single_precision: bool,
+}
+
+/// A Catmull-Clark surface's own parameters.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Subdivision {
+    /// Sharp edges by their ends, the lower first.
+    pub creases: HashMap<[u32; 2], f32>,
+    /// Sharp points.
+    pub sharp_points: HashMap<u32, f32>,
+    /// Whether points of one face alone are sharp.
+    pub sharp_corners: bool,
 }
 
 /// Values of an attribute that the engine hands on without reading it.
@@ -301,7 +316,7 @@ impl Mesh {
 const DEGENERATE: &str = "degenerate faces (a repeated vertex or no area)";
 
 /// Whether a position can be stored.
-fn is_usable(position: DVec3) -> bool {
+pub(super) fn is_usable(position: DVec3) -> bool {
     position.abs().cmple(DVec3::splat(COORDINATE_MAX)).all()
 }
 

@@ -9,6 +9,7 @@ mod assembly;
 mod budget;
 mod confine;
 mod cut;
+mod diced;
 mod emit;
 mod gltf;
 mod lines;
@@ -67,6 +68,8 @@ pub struct ImportOptions {
     pub memory_bytes: u64,
     /// The time code at which USD is read; none takes default values.
     pub frame: Option<f64>,
+    /// How fine to dice; none keeps faces as they are.
+    pub dice: Option<crate::dice::Rate>,
     /// Seconds that may pass until a USD file yields its next prim: a broken one may take for ever.
     pub patience_seconds: u64,
 }
@@ -78,6 +81,7 @@ impl Default for ImportOptions {
             up: UpAxis::Y,
             memory_bytes: 1 << 30,
             frame: None,
+            dice: None,
             patience_seconds: 300,
         }
     }

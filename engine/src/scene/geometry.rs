@@ -1,13 +1,15 @@
 //! Geometries: their streams, their copies, and the bake sets they carry.
 
 use std::collections::BTreeSet;
+use std::path::Path;
 
 use super::element::{Element, Value};
 use super::files::Files;
 use super::names::Names;
 use super::parse::limited;
 use super::{
-    BakeAttribute, BakeSet, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result, StreamSource,
+    BakeAttribute, BakeSet, Dice, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result,
+    StreamSource,
 };
 use crate::stream::schema::ATTRIBUTES_MAX;
 
@@ -112,8 +114,10 @@ impl<'a, 'd> Geometries<'a, 'd> {
     fn stream(&self, element: Element<'_>) -> Result<StreamSource> {
         match (element.optional("file")?, element.optional("procedural")?) {
             (Some(file), None) => {
-                element.expect_only(&["file"], &[])?;
-                self.files.stream(&file).map(StreamSource::File)
+                element.expect_only(&["file", "dice"], &[])?;
+                let path = self.files.stream(&file)?;
+                let dice = element.optional("dice")?.map(|dice| self.dice(&dice, &path)).transpose()?;
+                Ok(StreamSource::File(path, dice))
             }
             (None, Some(kind)) => {
                 element.expect_only(&["procedural", "seed", "micropolygons"], &[])?;
@@ -127,6 +131,24 @@ impl<'a, 'd> Geometries<'a, 'd> {
             (Some(_), Some(kind)) => Err(kind
                 .error(ErrorKind::Invalid, "stream has both `file` and `procedural`, expected one of them")),
         }
+    }
+
+    /// How a stream is to be diced.
+    fn dice(&self, value: &Value<'_>, path: &Path) -> Result<Dice> {
+        if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("mgs")) {
+            let message = "a stream of microgrids is diced already";
+            return Err(value.error(ErrorKind::Invalid, message).hint("dice it when it is imported"));
+        }
+        let dice = Dice::parse(value.text()).map_err(|error| {
+            let placed = value.error(error.kind(), error.message());
+            error.hint_text().into_iter().fold(placed, |placed, hint| placed.hint(hint))
+        })?;
+        if let Dice::Camera { name, .. } = &dice
+            && !self.cameras.all().any(|known| known == name)
+        {
+            return Err(value.unknown_word("camera:".len(), name, "camera", self.cameras.all()));
+        }
+        Ok(dice)
     }
 
     /// `<instance matrix=""/>`

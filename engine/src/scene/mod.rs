@@ -4,6 +4,7 @@
 //! `geometry`), names are resolved on the way (`names`), and files and transforms are checked (`files`, `matrix`).
 //! Instance files may be large: [`instances`] streams them.
 
+mod dice;
 mod element;
 mod files;
 mod geometry;
@@ -22,6 +23,7 @@ use std::path::{Path, PathBuf};
 
 use glam::DMat4;
 
+pub use self::dice::Dice;
 pub use self::files::Roots;
 pub use self::instances::{InstanceReader, for_each_instance};
 pub use self::parse::UNITS;
@@ -212,8 +214,8 @@ pub struct Geometry {
 /// Where microgrids come from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum StreamSource {
-    /// A file: .mgs, or one that is imported.
-    File(PathBuf),
+    /// A file: .mgs, or one that is imported, and perhaps diced.
+    File(PathBuf, Option<Dice>),
     /// A generator.
     Procedural(Procedural),
 }

@@ -11,7 +11,7 @@ use crate::{ErrorKind, Result};
 const NAME_MAX: usize = 64;
 
 /// Attributes that streams have themselves: a bake cannot add them.
-const RESERVED: [&str; 9] = [
+const RESERVED: [&str; 10] = [
     "P",
     standard::NORMAL,
     standard::RADIUS,
@@ -21,6 +21,7 @@ const RESERVED: [&str; 9] = [
     standard::ID,
     standard::INSTANCE,
     standard::BAKED,
+    standard::POINT,
 ];
 
 /// The names of one kind of thing, each with the value that declared it.
@@ -64,6 +65,11 @@ impl<'d> Names<'d> {
             return Err(value.error(ErrorKind::Invalid, message));
         }
         self.declare_once(value)
+    }
+
+    /// All names, in order.
+    pub fn all(&self) -> impl Iterator<Item = &str> {
+        self.declared.keys().map(String::as_str)
     }
 
     /// Declares the name of an attribute that a bake adds to a stream.

@@ -42,7 +42,8 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
             let radius = radius::default_radius(&mesh, &clusters, 1.0);
             radius::warn_radius(&mesh, radius, &mut report);
             for (id, placement) in places {
-                emitter.emit(&mesh, &clusters, placement, (*id, radius), &mut report)?;
+                let rate = options.dice.as_ref();
+                emitter.emit_diced(&mesh, &clusters, placement, rate, (*id, radius), &mut report)?;
             }
             drop(mesh);
             container.budget.give(bytes);

@@ -18,6 +18,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let radius = radius::default_radius(&mesh, &clusters, options.meters_per_unit);
     radius::warn_radius(&mesh, radius, &mut report);
     let mut emitter = Emitter::new(sink, Carried::by(&mesh), options)?;
-    emitter.emit(&mesh, &clusters, &Placement::HERE, (0, radius), &mut report)?;
+    let rate = options.dice.as_ref();
+    emitter.emit_diced(&mesh, &clusters, &Placement::HERE, rate, (0, radius), &mut report)?;
     Ok(report)
 }

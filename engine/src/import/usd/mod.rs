@@ -28,7 +28,9 @@ use self::walk::{Catalogue, Kind, Prim};
 use super::assembly::Assembly;
 use super::emit::{Carried, Emitter, Placement};
 use super::mesh::Mesh;
-use super::{Copies, GridSink, ImportOptions, ImportReport, SourceCounts, cut, radius};
+use super::{Copies, GridSink, ImportOptions, ImportReport, SourceCounts, cut, diced, radius};
+use crate::dice::Rate;
+use crate::stream::adapt::MatrixSource;
 use crate::stream::schema::UpAxis;
 use crate::{Error, ErrorKind, Result};
 
@@ -117,21 +119,21 @@ impl Import<'_> {
         for (number, prim) in prims.iter().enumerate() {
             if prototypes.binary_search(&prim.scope).is_err() {
                 let copies = Copies::new(self.assembly.clone(), prim.scope, self.counts[prim.scope as usize]);
-                self.prim(number, prim, Some(copies))?;
+                self.prim(number, prim, copies, false)?;
             }
         }
         for scope in prototypes {
             let copies = Copies::new(self.assembly.clone(), scope, self.counts[scope as usize]);
             self.emitter.copies(&copies)?;
             for (number, prim) in prims.iter().enumerate().filter(|(_, prim)| prim.scope == scope) {
-                self.prim(number, prim, None)?;
+                self.prim(number, prim, copies.clone(), true)?;
             }
         }
         Ok(())
     }
 
-    /// Reads a prim and writes it: once for each of `copies`, or once as a part of a prototype.
-    fn prim(&mut self, number: usize, prim: &Prim, copies: Option<Copies>) -> Result<()> {
+    /// Reads a prim and writes it: once for each of `copies`, or once as a part of their prototype.
+    fn prim(&mut self, number: usize, prim: &Prim, mut copies: Copies, is_prototype: bool) -> Result<()> {
         let read = match self.reader.geometry(number) {
             Ok(read) => read,
             // A broken layer ends its geometry; a limit, or a reader that is gone, ends the import
@@ -143,21 +145,27 @@ impl Import<'_> {
             Err(error) => return Err(error),
         };
         let (mut mesh, mut own) = (read.mesh, read.report);
+        // Dicing finishes what it makes, and needs the polygons of a surface as they are
+        let raw = (self.options.dice.is_some() && mesh.subdivision.is_some()).then(|| mesh.clone());
         mesh.finish(&mut own)?;
         self.count(&own, self.listed[prim.scope as usize]);
         let clusters = cut::cut(&mesh);
         let radius = radius::default_radius(&mesh, &clusters, self.options.meters_per_unit);
         radius::warn_radius(&mesh, radius, &mut self.report);
-        match copies {
-            None => self.emit(&mesh, &clusters, prim.scope_from_prim, (number, radius)),
-            Some(mut copies) => {
-                use crate::stream::adapt::MatrixSource;
-                while let Some(world_from_scope) = copies.next()? {
-                    self.emit(&mesh, &clusters, world_from_scope * prim.scope_from_prim, (number, radius))?;
-                }
-                Ok(())
-            }
+        let center = prim.scope_from_prim.transform_point3(mesh.bounds().center());
+        let mesh = raw.unwrap_or(mesh);
+        let rate = self.options.dice.as_ref();
+        let mut emit = |matrix: glam::DMat4, rate: Option<&Rate>| {
+            self.emit(&mesh, &clusters, matrix * prim.scope_from_prim, rate, (number, radius))
+        };
+        if is_prototype {
+            let rate = rate.map(|rate| diced::prototype_rate(rate, &mut copies, center)).transpose()?;
+            return emit(glam::DMat4::IDENTITY, rate.as_ref());
         }
+        while let Some(world_from_scope) = copies.next()? {
+            emit(world_from_scope, rate)?;
+        }
+        Ok(())
     }
 
     fn emit(
@@ -165,6 +173,7 @@ impl Import<'_> {
         mesh: &Mesh,
         clusters: &cut::Clusters,
         matrix: glam::DMat4,
+        rate: Option<&Rate>,
         (number, radius): (usize, f32),
     ) -> Result<()> {
         let id = u32::try_from(number).map_err(|_| Error::new(ErrorKind::Limit, "more than 2^32 prims"))?;
@@ -172,7 +181,7 @@ impl Import<'_> {
             self.report.skip("prims whose transform is flat or not finite", 1);
             return Ok(());
         };
-        self.emitter.emit(mesh, clusters, &placement, (id, radius), &mut self.report)
+        self.emitter.emit_diced(mesh, clusters, &placement, rate, (id, radius), &mut self.report)
     }
 
     /// Adds what was found in a prim, as often as the file lists it.

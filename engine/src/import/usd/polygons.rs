@@ -9,7 +9,8 @@ use super::primvar::{self, Interpolation, Primvar, Values};
 use super::read::{Geometry, Stage};
 use super::value;
 use super::walk::Prim;
-use crate::import::mesh::{Face, Mesh, NO_NORMAL};
+use crate::dice::SHARP;
+use crate::import::mesh::{Face, Mesh, NO_NORMAL, Subdivision};
 use crate::stream::Attribute;
 use crate::{Error, ErrorKind, Result};
 
@@ -68,12 +69,51 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         corners: indices.len(),
         corner_sources: &corner_sources,
     };
+    if scheme == "catmullClark" {
+        mesh.subdivision = Some(subdivision(stage, path));
+    }
     // The normals of a cage are not those of the surface it stands for
     if scheme == "none" || scheme == "bilinear" {
         push_normals(stage, prim, &elements, mesh);
     }
     dress(stage, prim, attributes, &elements, &Some, mesh, report);
     Ok(geometry)
+}
+
+/// The creases and corners of a subdivision surface. Lists that do not fit together end where they no longer do.
+fn subdivision(stage: &Stage, path: &str) -> Subdivision {
+    let integers = |name| stage.integers(path, name).unwrap_or_default();
+    let sharpnesses = |name| stage.numbers(path, name).unwrap_or_default();
+    let clamp = |sharpness: f64| (sharpness as f32).clamp(0.0, SHARP);
+    let boundary = stage.text(path, "interpolateBoundary");
+    let mut found = Subdivision {
+        sharp_corners: boundary.is_none_or(|boundary| boundary == "edgeAndCorner"),
+        ..Subdivision::default()
+    };
+    let (points, lengths) = (integers("creaseIndices"), integers("creaseLengths"));
+    let values = sharpnesses("creaseSharpnesses");
+    // One sharpness for each crease, or one for each of its edges
+    let edges: i64 = lengths.iter().map(|length| (length - 1).max(0)).sum();
+    let per_edge = values.len() as i64 == edges && values.len() != lengths.len();
+    let (mut first, mut edge) = (0_usize, 0);
+    for (crease, &length) in lengths.iter().enumerate() {
+        let run = usize::try_from(length).ok().and_then(|n| points.get(first..first.checked_add(n)?));
+        let Some(run) = run else { break };
+        for ends in run.windows(2) {
+            let sharpness = values.get(if per_edge { edge } else { crease }).copied().unwrap_or(0.0);
+            if let [Ok(a), Ok(b)] = [ends[0], ends[1]].map(u32::try_from) {
+                found.creases.insert([a.min(b), a.max(b)], clamp(sharpness));
+            }
+            edge += 1;
+        }
+        first += run.len();
+    }
+    for (&point, &sharpness) in integers("cornerIndices").iter().zip(&sharpnesses("cornerSharpnesses")) {
+        if let Ok(point) = u32::try_from(point) {
+            found.sharp_points.insert(point, clamp(sharpness));
+        }
+    }
+    found
 }
 
 /// Refuses a mesh whose numbers do not fit together, or that needs more memory than allowed.

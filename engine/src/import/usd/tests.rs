@@ -386,3 +386,49 @@ fn bombs_hit_a_limit() {
     let error = read(&desk.layer("large.usda", &" ".repeat(2 << 20)), &options).err().unwrap();
     assert_eq!((error.kind(), error.hint_text().is_some()), (ErrorKind::Limit, true), "{error}");
 }
+
+/// Catches a surface that is diced as its cage, in the wrong space, with cracks between its grids, or with results that
+/// cannot be brought back to its points.
+#[test]
+fn subdivision_surfaces_are_diced_in_the_world() {
+    let text = r#"
+def Mesh "ball" {
+    int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+    int[] faceVertexIndices = [0,2,3,1, 4,5,7,6, 0,1,5,4, 2,6,7,3, 0,4,6,2, 1,3,7,5]
+    point3f[] points = [(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-1,-1,1), (1,-1,1), (-1,1,1), (1,1,1)]
+    float[] primvars:height = [-1, -1, -1, -1, 1, 1, 1, 1] ( interpolation = "vertex" )
+    float3 xformOp:scale = (10, 10, 10)
+    uniform token[] xformOpOrder = ["xformOp:scale"]
+}"#;
+    let desk = Desk::new();
+    let path = desk.layer("a.usda", &format!("{HEAD}{text}"));
+    let dice = Some(crate::dice::Rate::world(0.5).unwrap());
+    let (sink, report) = read(&path, &ImportOptions { dice, ..ImportOptions::default() }).unwrap();
+    assert_eq!(report.source.quads, 6);
+    assert_eq!(report.micropolygons, 6 * 64 * 64);
+    let [point, height] = [names::POINT, "height"].map(|name| sink.schema.find(name).unwrap());
+    let mut edges = std::collections::BTreeMap::<[[u64; 3]; 2], i32>::new();
+    let mut points = std::collections::BTreeSet::new();
+    for grid in &sink.grids {
+        let at = |vertex: u8| grid.position(usize::from(vertex));
+        for face in grid.faces() {
+            for i in 0..face.len() {
+                let ends = [at(face[i]), at(face[(i + 1) % face.len()])];
+                assert!(ends[0].distance(ends[1]) < 0.51);
+                let [a, b] = ends.map(|p| p.to_array().map(f64::to_bits));
+                *edges.entry([a.min(b), a.max(b)]).or_default() += if a < b { 1 } else { -1 };
+            }
+        }
+        for vertex in 0..grid.vertex_count() {
+            // Half of the corner's place, see the dicer's own tests
+            let p = grid.position(vertex);
+            assert!((4.9..9.0).contains(&p.length()), "{p}");
+            assert!((f64::from(grid.value(&sink.schema, height, vertex, 0)) - p.z / 10.0).abs() < 1e-5);
+            assert!(grid.vec3(&sink.schema, 0, vertex).as_dvec3().dot(p.normalize()) > 0.7);
+            let bytes = &grid.columns[point][4 * vertex..4 * vertex + 4];
+            points.insert(u32::from_le_bytes(bytes.try_into().unwrap()));
+        }
+    }
+    assert!(edges.values().all(|&balance| balance == 0));
+    assert_eq!(points.into_iter().collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5, 6, 7, u32::MAX]);
+}

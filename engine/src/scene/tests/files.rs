@@ -34,12 +34,12 @@ fn files_are_found_beside_the_scene() {
     ] {
         let (folder, scene) = with_files(stream, "scatter.csv", frame);
         let geometry = &scene.unwrap().geometries[0];
-        assert_eq!(geometry.streams, [StreamSource::File(folder.path().join(expected))]);
+        assert_eq!(geometry.streams, [StreamSource::File(folder.path().join(expected), None)]);
         assert_eq!(geometry.instances, [Instances::File(folder.path().join("scatter.csv"))]);
     }
     let elsewhere = tempfile::NamedTempFile::with_suffix(".mgs").unwrap();
     let (_folder, scene) = with_files(elsewhere.path().to_str().unwrap(), "scatter.csv", None);
-    assert_eq!(scene.unwrap().geometries[0].streams, [StreamSource::File(elsewhere.path().into())]);
+    assert_eq!(scene.unwrap().geometries[0].streams, [StreamSource::File(elsewhere.path().into(), None)]);
 }
 
 /// Catches a scene from elsewhere that reads a file of this machine by an absolute path, by `..` or through a link.

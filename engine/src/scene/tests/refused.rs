@@ -76,7 +76,7 @@ fn missing_attributes_and_elements_are_named() {
 <shader name="plain" type="sh_occlusion" | «<shader name="plain" | attribute `type` of `shader` is missing | add
 <stream procedural="jungle" micropolygons="1000" | «<stream | attribute `file` or `procedural` of `stream` is missing |
 <stream procedural="jungle" micropolygons="1000" | «<stream procedural="jungle" | attribute `micropolygons` of `stream` is missing | add
-<stream procedural="jungle" m | <stream file="a.ply" «m | unknown attribute `micropolygons` of `stream`, expected `file` |
+<stream procedural="jungle" m | <stream file="a.ply" «m | unknown attribute `micropolygons` of `stream`, expected one of `file`, `dice` |
 procedural="jungle" | file="a.ply" procedural="«jungle" | stream has both `file` and `procedural`, expected one |
 <geometry name="ground" | «<geometry name="empty" occluder="true"/><geometry name="ground" | geometry `empty` has no stream |
 <bakeset name="probes"> <attribute name="sh" shader="plain"/> | «<bakeset name="probes"> | bake set `probes` has no attributes |

@@ -1,0 +1,339 @@
+//! Meshes diced on their way into microgrids.
+//!
+//! Faces are diced in chunks that lie close together, several at once, and written in order. All vertices are rounded to one
+//! step for the whole mesh, so that chunks agree where they meet.
+
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+use super::emit::{self, Emitter, Placement};
+use super::mesh::{Extra, ExtraRate, Face, Mesh, is_usable};
+use super::{ImportReport, cut};
+use crate::dice::cage::{Cage, Prepared};
+use crate::dice::polygons::Polygons;
+use crate::dice::{Diced, NO_POINT, Rate};
+use crate::{Error, ErrorKind, Result};
+
+/// Faces that a chunk becomes at most, unless one of its faces alone becomes more: some 30 MB.
+const CHUNK_MAX: u64 = 1 << 17;
+
+/// Faces that a mesh may become.
+const FACES_MAX: u64 = 4_000_000_000;
+
+/// What a mesh is to be diced as: its faces, linearly, or the surface that they stand for.
+enum Surface<'a> {
+    Polygons(Polygons),
+    CatmullClark(Prepared<'a>),
+}
+
+/// Writes a copy of a mesh, diced. The mesh is not finished if it has a surface.
+pub(super) fn emit(
+    emitter: &mut Emitter<'_>,
+    mut mesh: Mesh,
+    placement: &Placement,
+    rate: &Rate,
+    (first_id, radius): (u32, f32),
+    report: &mut ImportReport,
+) -> Result<()> {
+    place(&mut mesh, placement);
+    let thin = take_thin(&mut mesh, report)?;
+    if !thin.faces.is_empty() {
+        emitter.emit(&thin, &cut::cut(&thin), &Placement::HERE, (first_id, radius), report)?;
+    }
+    let columns = Columns::of(&mesh);
+    let cage = match mesh.subdivision.is_some() {
+        true => Some(cage(&mut mesh, &columns, report)),
+        false => {
+            mesh.finish(report)?;
+            None
+        }
+    };
+    let surface = match &cage {
+        Some(cage) => Surface::CatmullClark(cage.prepare(rate)),
+        None => Surface::Polygons(polygons(&mesh, &columns)),
+    };
+    let chunks = chunks(&mesh, &surface, rate)?;
+    let size = mesh.bounds().size().max_element();
+    let step = emit::power_of_two(emit::resolution(size));
+    for batch in chunks.chunks(2 * rayon::current_num_threads()) {
+        let diced: Vec<Mesh> = (batch.par_iter())
+            .map(|faces| {
+                let diced = match &surface {
+                    Surface::Polygons(polygons) => polygons.dice(faces, rate),
+                    Surface::CatmullClark(prepared) => prepared.dice(faces),
+                };
+                columns.mesh(&mesh, diced, step)
+            })
+            .collect();
+        for mut part in diced {
+            let mut own = ImportReport::default();
+            part.finish(&mut own)?;
+            own.skipped.iter().for_each(|(reason, count)| report.skip(reason, *count));
+            let clusters = cut::cut(&part);
+            emitter.emit(&part, &clusters, &Placement::HERE, (first_id, radius), report)?;
+        }
+    }
+    Ok(())
+}
+
+/// Brings a mesh to where a copy stands.
+fn place(mesh: &mut Mesh, placement: &Placement) {
+    mesh.positions.iter_mut().for_each(|position| *position = placement.point(*position));
+    mesh.normals.iter_mut().for_each(|normal| *normal = placement.normal(*normal));
+    mesh.radii.iter_mut().for_each(|radius| *radius *= placement.scale as f32);
+    mesh.single_precision = false;
+    if placement.mirrored {
+        for face in &mesh.faces {
+            let range = face.start as usize + 1..(face.start + face.arity) as usize;
+            mesh.corners[range.clone()].reverse();
+            for parallel in [&mut mesh.corner_normals, &mut mesh.corner_variants] {
+                if !parallel.is_empty() {
+                    parallel[range.clone()].reverse();
+                }
+            }
+        }
+    }
+}
+
+/// Takes points and lines out of a mesh: these stay as they are.
+fn take_thin(mesh: &mut Mesh, report: &mut ImportReport) -> Result<Mesh> {
+    if mesh.faces.iter().all(|face| face.arity > 2) {
+        return Ok(Mesh::default());
+    }
+    let mut thin = mesh.clone();
+    thin.faces.retain(|face| face.arity < 3);
+    mesh.faces.retain(|face| face.arity > 2);
+    thin.finish(report)?;
+    Ok(thin)
+}
+
+/// The faces of a mesh as a cage; those that cannot be one are dropped and counted.
+fn cage(mesh: &mut Mesh, columns: &Columns, report: &mut ImportReport) -> Cage {
+    let mut seen = std::collections::HashSet::new();
+    let faces = std::mem::take(&mut mesh.faces);
+    let (mut bad, mut kept) = (0, Vec::with_capacity(faces.len()));
+    for face in faces {
+        let corners = mesh.face_corners(&face);
+        seen.clear();
+        let is_good = corners.iter().all(|&c| is_usable(mesh.positions[c as usize]) && seen.insert(c));
+        if is_good { kept.push(face) } else { bad += 1 }
+    }
+    report.skip("faces of subdivision surfaces with a repeated or impossible point", bad);
+    mesh.faces = kept;
+    let subdivision = mesh.subdivision.as_ref().expect("a mesh with a surface");
+    let mut cage = Cage {
+        positions: mesh.positions.clone(),
+        smooth_width: columns.smooth.iter().map(|column| column.components).sum(),
+        linear_width: columns.linear.iter().map(|column| column.components).sum(),
+        creases: subdivision.creases.clone(),
+        sharp_points: subdivision.sharp_points.clone(),
+        sharp_corners: subdivision.sharp_corners,
+        ..Cage::default()
+    };
+    for face in &mesh.faces {
+        cage.corners.extend_from_slice(mesh.face_corners(face));
+        cage.ends.push(cage.corners.len() as u32);
+        for corner in face.start..face.start + face.arity {
+            columns.linear.iter().for_each(|column| column.push(mesh, corner as usize, &mut cage.linear));
+        }
+    }
+    for position in 0..mesh.positions.len() {
+        columns.smooth.iter().for_each(|column| column.push_at(mesh, position, None, &mut cage.smooth));
+    }
+    cage
+}
+
+/// The faces of a finished mesh as polygons.
+fn polygons(mesh: &Mesh, columns: &Columns) -> Polygons {
+    let all = || columns.smooth.iter().chain(&columns.linear);
+    let width = all().map(|column| column.components).sum();
+    let mut polygons = Polygons { positions: mesh.positions.clone(), width, ..Polygons::default() };
+    for face in &mesh.faces {
+        polygons.corners.extend_from_slice(mesh.face_corners(face));
+        polygons.ends.push(polygons.corners.len() as u32);
+        for corner in face.start as usize..(face.start + face.arity) as usize {
+            polygons.normals.push(emit::corner_normal(mesh, face, corner, &Placement::HERE));
+            all().for_each(|column| column.push(mesh, corner, &mut polygons.values));
+        }
+    }
+    polygons
+}
+
+/// Faces in chunks, along a Morton curve through the mesh's box.
+fn chunks(mesh: &Mesh, surface: &Surface<'_>, rate: &Rate) -> Result<Vec<Vec<u32>>> {
+    let bounds = mesh.bounds();
+    let scale = 1_048_575.0 / bounds.size().max_element().max(f64::MIN_POSITIVE);
+    let spread = |x: f64| (0..20).fold(0_u64, |sum, bit| sum | ((x as u64) >> bit & 1) << (3 * bit));
+    let mut order: Vec<(u64, u32, u64)> = (0..mesh.faces.len() as u32)
+        .into_par_iter()
+        .map(|face| {
+            let (center, count) = match surface {
+                Surface::Polygons(polygons) => (polygons.center(face), polygons.estimate(face, rate)),
+                Surface::CatmullClark(prepared) => (prepared.center(face), prepared.estimate(face)),
+            };
+            let p = (center - bounds.min) * scale;
+            (spread(p.x) | spread(p.y) << 1 | spread(p.z) << 2, face, count)
+        })
+        .collect();
+    order.sort_unstable();
+    let total = order.iter().fold(0_u64, |sum, (_, _, count)| sum.saturating_add(*count));
+    if total > FACES_MAX {
+        let message =
+            format!("dicing would make about {total} faces of one mesh, at most {FACES_MAX} are made");
+        return Err(Error::new(ErrorKind::Limit, message).hint("dice less finely"));
+    }
+    let (mut chunks, mut chunk, mut sum) = (Vec::new(), Vec::new(), 0);
+    for (_, face, count) in order {
+        if sum > 0 && sum + count > CHUNK_MAX {
+            chunks.push(std::mem::take(&mut chunk));
+            sum = 0;
+        }
+        chunk.push(face);
+        sum += count;
+    }
+    chunks.push(chunk);
+    Ok(chunks)
+}
+
+/// What a column of values is in a mesh.
+#[derive(Clone, Copy)]
+enum Kind {
+    Color,
+    Opacity,
+    Extra(usize),
+}
+
+/// A column of values that dicing interpolates.
+struct Column {
+    kind: Kind,
+    components: usize,
+}
+
+/// The values of a mesh that dicing interpolates: those of points with the surface, those of corners within faces.
+struct Columns {
+    smooth: Vec<Column>,
+    linear: Vec<Column>,
+}
+
+impl Columns {
+    fn of(mesh: &Mesh) -> Self {
+        let mut columns = Self { smooth: Vec::new(), linear: Vec::new() };
+        let (color, opacity) =
+            (Column { kind: Kind::Color, components: 3 }, Column { kind: Kind::Opacity, components: 1 });
+        if !mesh.variant_colors.is_empty() {
+            columns.linear.push(color);
+        } else if !mesh.colors.is_empty() {
+            columns.smooth.push(color);
+        }
+        if !mesh.variant_opacities.is_empty() {
+            columns.linear.push(opacity);
+        } else if !mesh.opacities.is_empty() {
+            columns.smooth.push(opacity);
+        }
+        for (number, extra) in mesh.extras.iter().enumerate() {
+            let column = Column { kind: Kind::Extra(number), components: extra.components };
+            match extra.rate {
+                ExtraRate::Constant => {}
+                ExtraRate::Position => columns.smooth.push(column),
+                ExtraRate::Variant => columns.linear.push(column),
+            }
+        }
+        columns
+    }
+
+    /// Diced faces as a mesh of their own.
+    fn mesh(&self, from: &Mesh, diced: Diced, step: f64) -> Mesh {
+        let mut mesh = Mesh {
+            positions: diced.positions.iter().map(|p| (*p / step).round() * step).collect(),
+            palette: from.palette.clone(),
+            extras: from.extras.clone(),
+            ..Mesh::default()
+        };
+        mesh.normals = diced.normals;
+        if mesh.normals.contains(&Vec3::ZERO) {
+            // A zero normal would pass for a given one
+            let numbers = mesh.normals.iter().enumerate();
+            let numbers: Vec<u32> = numbers
+                .map(|(i, normal)| if *normal == Vec3::ZERO { super::mesh::NO_NORMAL } else { i as u32 })
+                .collect();
+            let used = diced.faces.iter().flat_map(|face| face.iter().filter(|&&v| v != NO_POINT));
+            mesh.corner_normals = used.map(|&vertex| numbers[vertex as usize]).collect();
+        }
+        let number = |&point: &u32| match point {
+            NO_POINT => NO_POINT,
+            point => from.point_numbers.get(point as usize).copied().unwrap_or(point),
+        };
+        mesh.point_numbers = diced.points.iter().map(number).collect();
+        for (face, &source) in diced.faces.iter().zip(&diced.sources) {
+            let arity = face.iter().filter(|&&vertex| vertex != NO_POINT).count();
+            let start = mesh.corners.len() as u32;
+            mesh.corners.extend_from_slice(&face[..arity]);
+            mesh.faces.push(Face { start, arity: arity as u32, ..from.faces[source as usize] });
+        }
+        self.spread(&diced.values, mesh.positions.len(), &mut mesh);
+        mesh
+    }
+
+    /// Takes rows of values apart.
+    fn spread(&self, values: &[f32], count: usize, mesh: &mut Mesh) {
+        let width: usize = self.smooth.iter().chain(&self.linear).map(|column| column.components).sum();
+        let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
+        let mut first = 0;
+        for Column { kind, components } in self.smooth.iter().chain(&self.linear) {
+            let value = |row: usize, i: usize| values[row * width + first + i];
+            match kind {
+                Kind::Color => {
+                    mesh.colors = (0..count).map(|row| [0, 1, 2].map(|i| byte(value(row, i)))).collect();
+                }
+                Kind::Opacity => mesh.opacities = (0..count).map(|row| byte(value(row, 0))).collect(),
+                Kind::Extra(number) => {
+                    let all = (0..count).flat_map(|row| (0..*components).map(move |i| (row, i)));
+                    let values = all.map(|(row, i)| value(row, i)).collect();
+                    mesh.extras[*number] =
+                        Extra { components: *components, rate: ExtraRate::Position, values };
+                }
+            }
+            first += components;
+        }
+    }
+}
+
+impl Column {
+    /// Appends the value at a corner.
+    fn push(&self, mesh: &Mesh, corner: usize, out: &mut Vec<f32>) {
+        self.push_at(mesh, mesh.corners[corner] as usize, mesh.variant(corner), out);
+    }
+
+    /// Appends the value at a position and a variant.
+    fn push_at(&self, mesh: &Mesh, position: usize, variant: Option<u32>, out: &mut Vec<f32>) {
+        let variant_index = variant.map_or(usize::MAX, |variant| variant as usize);
+        match self.kind {
+            Kind::Color => {
+                let own = mesh.variant_colors.get(variant_index).or_else(|| mesh.colors.get(position));
+                out.extend(own.copied().unwrap_or([128; 3]).map(f32::from));
+            }
+            Kind::Opacity => {
+                let own = mesh.variant_opacities.get(variant_index).or_else(|| mesh.opacities.get(position));
+                out.push(f32::from(own.copied().unwrap_or(255)));
+            }
+            Kind::Extra(number) => match mesh.extras[number].at(position, variant) {
+                Some(value) => out.extend_from_slice(value),
+                None => out.resize(out.len() + self.components, 0.0),
+            },
+        }
+    }
+}
+
+/// A rate for a prototype: that of the copy that needs the finest, in the prototype's own units, near `center`.
+pub(super) fn prototype_rate(rate: &Rate, copies: &mut super::Copies, center: DVec3) -> Result<Rate> {
+    use crate::stream::adapt::MatrixSource;
+    let mut finest = f64::INFINITY;
+    copies.rewind()?;
+    while let Some(matrix) = copies.next()? {
+        let axes = [matrix.x_axis, matrix.y_axis, matrix.z_axis].map(|axis| axis.truncate().length());
+        let scale = axes.into_iter().fold(0.0, f64::max).max(f64::MIN_POSITIVE);
+        finest = finest.min(rate.edge_at(matrix.transform_point3(center)) / scale);
+    }
+    copies.rewind()?;
+    Rate::world(finest)
+}
