@@ -1,5 +1,7 @@
 //! What the tests share: streams in memory, meshes with known answers, and the shortest way from both to coefficients.
 
+pub mod postgres;
+
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

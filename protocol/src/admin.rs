@@ -1,0 +1,166 @@
+//! What administrators say, and hear: workers, tokens, tickets, projects, the audit, storage.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::states::Role;
+
+/// A worker as lists have it.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct WorkerDetail {
+    /// Its name.
+    pub name: String,
+    /// `busy`, `idle`, `draining`, `locked`, `sick` or `lost`.
+    pub state: String,
+    /// What it is and has.
+    pub labels: Vec<String>,
+    /// Memory that it may use.
+    pub memory_bytes: i64,
+    /// The program's version.
+    pub version: String,
+    /// Batches that it has.
+    pub leased: i64,
+    /// Batches of which it was to blame for the failure, lately.
+    pub errors: i64,
+    /// Milliseconds since 1970 when it was last heard of.
+    pub last_seen: i64,
+}
+
+/// Which hashes are not in storage, or not known to belong to the project.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct MissingRequest {
+    /// The project.
+    pub project: String,
+    /// SHA-256 in hexadecimal, up to 65,536.
+    pub sha256: Vec<String>,
+}
+
+/// The hashes to upload.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct MissingReply {
+    /// Those that are missing.
+    pub missing: Vec<String>,
+}
+
+/// A token to be.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct TokenRequest {
+    /// What it may do.
+    pub role: Role,
+    /// The only project that it may see and change.
+    #[serde(default)]
+    pub project: Option<String>,
+    /// Whose it is.
+    pub label: String,
+    /// Seconds until it expires.
+    #[serde(default)]
+    pub expires_s: Option<i64>,
+}
+
+/// A secret, shown this once.
+#[derive(Clone, Serialize, Deserialize, ToSchema)]
+pub struct Secret {
+    /// Its id, which is no secret.
+    pub id: String,
+    /// The secret.
+    pub secret: String,
+}
+
+/// A token as lists have it.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct TokenDetail {
+    /// Its id.
+    pub id: String,
+    /// What it may do.
+    pub role: Role,
+    /// The only project that it may see and change.
+    pub project: Option<String>,
+    /// Whose it is.
+    pub label: String,
+    /// When it was made.
+    pub created_at: i64,
+    /// When it expires.
+    pub expires_at: Option<i64>,
+    /// When it was revoked.
+    pub revoked_at: Option<i64>,
+    /// When it was last used, to the minute.
+    pub last_used_at: Option<i64>,
+}
+
+/// A ticket by which workers enrol.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct TicketRequest {
+    /// Workers that may enrol with it.
+    pub uses: i64,
+    /// Seconds until it expires.
+    pub expires_s: i64,
+    /// Labels that every such worker gets.
+    #[serde(default)]
+    pub labels: Vec<String>,
+}
+
+/// A worker trades a ticket for a token of its own.
+#[derive(Clone, Serialize, Deserialize, ToSchema)]
+pub struct EnrolRequest {
+    /// The ticket's secret.
+    pub ticket: String,
+    /// The worker's name: the token works for this name only.
+    pub name: String,
+}
+
+/// A project.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct Project {
+    /// Its name.
+    pub name: String,
+    /// Its share of the farm, against those of others.
+    pub share: i64,
+    /// Batches that run at once at most, over all of its jobs.
+    pub running_max: Option<i64>,
+}
+
+/// A change, and who made it.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct AuditEntry {
+    /// Its number.
+    pub id: i64,
+    /// Milliseconds since 1970.
+    pub at: i64,
+    /// The token's label.
+    pub actor: String,
+    /// The token's id; none for anonymous requests.
+    pub token: Option<String>,
+    /// The caller's address.
+    pub address: String,
+    /// Method and path.
+    pub action: String,
+    /// HTTP status of the answer.
+    pub status: i64,
+}
+
+/// A page of the audit, latest first.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct AuditPage {
+    /// Entries.
+    pub entries: Vec<AuditEntry>,
+    /// The cursor of the next page.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<i64>,
+}
+
+/// What garbage collection removed, or would remove.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct GcReport {
+    /// Whether nothing was removed.
+    pub dry_run: bool,
+    /// Folders of jobs that are past their retention.
+    pub jobs: Vec<String>,
+    /// Parts that no manifest and no merge needs any more.
+    pub parts: u64,
+    /// Assets that no job refers to.
+    pub assets: u64,
+    /// Brick maps that no job refers to.
+    pub brick_maps: u64,
+    /// Bytes of all of these.
+    pub bytes: u64,
+}

@@ -1,0 +1,53 @@
+//! Which projects have uploaded which assets, and which parts a pass has committed.
+
+use protocol::work::{PartEntry, PartPage};
+
+use super::Store;
+use crate::{Result, values};
+
+impl Store {
+    /// The hashes among `hashes` that the project has not uploaded.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn missing_assets(&self, project: &str, hashes: &[String]) -> Result<Vec<String>> {
+        let mut missing = Vec::new();
+        for chunk in hashes.chunks(500) {
+            let list = super::placeholders(2, chunk.len());
+            let sql = format!("SELECT sha256 FROM asset WHERE project = $1 AND sha256 IN ({list})");
+            let mut values = values![project];
+            values.extend(chunk.iter().map(Into::into));
+            let rows = self.query(sql, values).await?;
+            let known = rows.iter().map(|row| row.text(0)).collect::<Result<Vec<_>>>()?;
+            missing.extend(chunk.iter().filter(|hash| !known.contains(hash)).cloned());
+        }
+        Ok(missing)
+    }
+
+    /// Notes that the project has uploaded an asset.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn add_asset(&self, project: &str, sha256: &str, bytes: i64, now: i64) -> Result<()> {
+        let mut tx = self.begin().await?;
+        let sql = "INSERT INTO asset (project, sha256, bytes, created_at) VALUES ($1, $2, $3, $4) ON CONFLICT DO NOTHING";
+        tx.execute(sql.into(), values![project, sha256, bytes, now]).await?;
+        self.commit("asset", tx).await
+    }
+
+    /// The committed parts of a pass after batch `after`, up to `limit`.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn parts(&self, pass: i64, after: i64, limit: i64) -> Result<PartPage> {
+        let sql = "SELECT seq, fence, sha256, bytes FROM batch
+            WHERE pass_id = $1 AND seq > $2 AND state = 2 ORDER BY seq LIMIT $3";
+        let rows = self.query(sql, values![pass, after, limit]).await?;
+        let part = |row: &super::Row| {
+            Ok(PartEntry { batch: row.int(0)?, fence: row.int(1)?, sha256: row.text(2)?, bytes: row.int(3)? })
+        };
+        let parts = rows.iter().map(part).collect::<Result<Vec<_>>>()?;
+        let next = if parts.len() as i64 == limit { parts.last().map(|part| part.batch) } else { None };
+        Ok(PartPage { parts, next })
+    }
+}

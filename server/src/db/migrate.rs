@@ -1,0 +1,55 @@
+//! The schema's versions, embedded in the program: one script each, for each database.
+
+use super::Store;
+use crate::error::Kind;
+use crate::{Error, Result, values};
+
+/// For each version, from 1: SQLite's script and PostgreSQL's.
+const MIGRATIONS: [(&str, &str); 1] = [(
+    include_str!("../../../migrations/sqlite/0001_queue.sql"),
+    include_str!("../../../migrations/postgres/0001_queue.sql"),
+)];
+
+/// Takes the steps that are missing, each in one transaction.
+pub(super) async fn run(store: &Store) -> Result<()> {
+    store.driver().script("CREATE TABLE IF NOT EXISTS schema_meta (version BIGINT NOT NULL)").await?;
+    let postgres = store.dialect().name == "postgres";
+    for (number, (for_sqlite, for_postgres)) in MIGRATIONS.into_iter().enumerate() {
+        let mut tx = store.begin().await?;
+        if postgres {
+            // Two coordinators may start at once
+            tx.execute("LOCK TABLE schema_meta IN EXCLUSIVE MODE".into(), vec![]).await?;
+        }
+        let found = tx.query("SELECT version FROM schema_meta".into(), vec![]).await?;
+        let found = found.first().map(|row| row.int(0)).transpose()?;
+        let latest = MIGRATIONS.len() as i64;
+        if found.unwrap_or(0) > latest {
+            let message =
+                format!("the database has schema version `{}`, `{latest}` wanted", found.unwrap_or(0));
+            return Err(Error::new(Kind::Conflict, message).hint("use the newer program"));
+        }
+        let version = number as i64 + 1;
+        if found.unwrap_or(0) >= version {
+            continue;
+        }
+        let script = if postgres { for_postgres } else { for_sqlite };
+        for statement in statements(script) {
+            tx.execute(statement.into(), vec![]).await?;
+        }
+        let sql = match found {
+            None => "INSERT INTO schema_meta (version) VALUES ($1)",
+            Some(_) => "UPDATE schema_meta SET version = $1",
+        };
+        tx.execute(sql.into(), values![version]).await?;
+        tx.commit().await?;
+    }
+    Ok(())
+}
+
+/// The statements of a script. Our scripts have no semicolon but at the end of a statement, and comments on lines of
+/// their own.
+fn statements(script: &'static str) -> Vec<String> {
+    let lines = script.lines().filter(|line| !line.trim_start().starts_with("--"));
+    let text = lines.collect::<Vec<_>>().join("\n");
+    text.split(';').map(str::trim).filter(|s| !s.is_empty()).map(str::to_owned).collect()
+}

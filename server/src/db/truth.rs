@@ -1,0 +1,62 @@
+//! Whether the database agrees with itself: counts equal the rows they count. For tests, and for whoever is in doubt.
+
+use super::Store;
+use crate::Result;
+
+/// A segment whose counts are not those of its batches.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Drift {
+    /// The pass.
+    pub pass: i64,
+    /// The segment.
+    pub segment: i64,
+    /// Ready, leased, done, failed, skipped as counted.
+    pub counted: [i64; 5],
+    /// And as they are.
+    pub actual: [i64; 5],
+}
+
+impl Store {
+    /// Segments whose counts are not those of their batches; none, always.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn drift(&self) -> Result<Vec<Drift>> {
+        let counts = ["0", "1", "2", "3", "4, 5"].map(|states| {
+            format!("CAST(COALESCE(SUM(CASE WHEN b.state IN ({states}) THEN 1 ELSE 0 END), 0) AS BIGINT)")
+        });
+        let sql = format!(
+            "SELECT s.pass_id, s.seg, s.n_ready, s.n_leased, s.n_done, s.n_failed, s.n_skipped, {}
+            FROM segment s LEFT JOIN batch b ON b.pass_id = s.pass_id AND b.seg = s.seg
+            GROUP BY s.pass_id, s.seg, s.n_ready, s.n_leased, s.n_done, s.n_failed, s.n_skipped",
+            counts.join(", ")
+        );
+        let mut drifts = Vec::new();
+        for row in self.query(sql, vec![]).await? {
+            let five = |first: usize| -> Result<[i64; 5]> {
+                let mut counts = [0; 5];
+                for (place, count) in counts.iter_mut().enumerate() {
+                    *count = row.int(first + place)?;
+                }
+                Ok(counts)
+            };
+            let (counted, actual) = (five(2)?, five(7)?);
+            if counted != actual {
+                drifts.push(Drift { pass: row.int(0)?, segment: row.int(1)?, counted, actual });
+            }
+        }
+        Ok(drifts)
+    }
+
+    /// Batches that are leased to no lease, and leases that count other batches than they have; none, always.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn orphans(&self) -> Result<i64> {
+        let sql = "SELECT (SELECT COUNT(*) FROM batch b WHERE b.state = 1
+                AND NOT EXISTS (SELECT 1 FROM lease l WHERE l.id = b.lease_id)) +
+            (SELECT COUNT(*) FROM lease l WHERE l.n <>
+                (SELECT COUNT(*) FROM batch b WHERE b.lease_id = l.id AND b.state = 1))";
+        self.query_one(sql, vec![]).await?.map_or(Ok(0), |row| row.int(0))
+    }
+}
