@@ -94,7 +94,8 @@ async fn leases_last_as_long_as_heartbeats_come(mut queue: Queue) {
     assert_eq!(queue.store.expire(&queue.around(9)).await.unwrap().len(), 1);
     queue.now += TTL;
     assert_eq!(queue.store.expire(&queue.around(9)).await.unwrap().len(), 1);
-    let (extended, ended) = queue.store.extend("w1", std::slice::from_ref(&kept), TTL, queue.now).await.unwrap();
+    let (extended, ended) =
+        queue.store.extend("w1", std::slice::from_ref(&kept), TTL, queue.now).await.unwrap();
     assert_eq!((extended, ended), (vec![], vec![kept]));
 }
 
