@@ -40,6 +40,14 @@ pub struct BrickMapReport {
     pub micropolygons_per_second: f64,
     /// Whether it was there already.
     pub reused: bool,
+    /// Seconds of the pass that counts, of the one that fills, and of building the partitions.
+    pub phase_seconds: [f64; 3],
+    /// Partitions that were built each on its own.
+    pub partitions: u64,
+    /// Those of them that an interrupted build had left.
+    pub partitions_continued: u64,
+    /// Bytes of temporary data.
+    pub scratch_bytes: u64,
 }
 
 /// The tracing part of a report.
