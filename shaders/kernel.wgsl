@@ -15,6 +15,9 @@ const NOT_IN_CUT: u32 = 0xfffffffeu;
 @group(1) @binding(6) var<storage, read> items_in: ItemsRead;
 @group(1) @binding(7) var<storage, read_write> items_out: Items;
 
+var<workgroup> workgroup_nodes: atomic<u32>;
+var<workgroup> workgroup_leaf_rays: atomic<u32>;
+
 struct ItemsRead {
     counts: array<u32, 4>,
     list: array<Item>,
@@ -271,6 +274,48 @@ fn walk(lane: u32, size: u32) {
 fn end_ray(done: u32) {
     atomicAdd(&rays[ray_index].extinction, min(total, EXTINCTION_ENDED));
     atomicAdd(&rays[ray_index].state, 2u * spilled + done);
-    atomicAdd(&items_out.nodes, counted_nodes);
-    atomicAdd(&items_out.leaf_rays, counted_leaf_rays);
+}
+
+// Adds what the lanes of a workgroup counted to the dispatch's sums
+fn add_counts(index: u32) {
+    atomicAdd(&workgroup_nodes, counted_nodes);
+    atomicAdd(&workgroup_leaf_rays, counted_leaf_rays);
+    workgroupBarrier();
+    if index == 0u {
+        atomicAdd(&items_out.nodes, atomicLoad(&workgroup_nodes));
+        atomicAdd(&items_out.leaf_rays, atomicLoad(&workgroup_leaf_rays));
+    }
+}
+
+// New rays: a workgroup has neighbouring directions of one point
+fn trace_slice(workgroup: u32, index: u32, lane: u32, size: u32) {
+    let number = batch.first + workgroup;
+    let point = number / batch.slices;
+    let turn = (number % batch.slices) * 64u + index;
+    let exists = point < batch.points && turn < batch.samples;
+    begin_ray(min(point, batch.points - 1u) * batch.samples + sample_in_order(min(turn, batch.samples - 1u)));
+    is_active = exists;
+    if exists {
+        begin_brick(batch.root);
+    }
+    walk(lane, size);
+    if exists {
+        end_ray(1u);
+    }
+    add_counts(index);
+}
+
+fn resume_item(item: Item) {
+    begin_ray(item.ray);
+    before = min(atomicLoad(&rays[item.ray].extinction), EXTINCTION_ENDED);
+    if before <= ray_limit {
+        if item.order == WAITS_FOR_BRICK {
+            begin_brick(item.line);
+        } else {
+            current_line = item.line;
+            current_order = item.order;
+        }
+        walk(0u, 1u);
+    }
+    end_ray(0xfffffffeu);
 }

@@ -25,3 +25,18 @@ fn meet_leaves(lane: u32, size: u32) {
     }
     meet_triangles(leaf, triangles, near);
 }
+
+@compute @workgroup_size(64)
+fn trace(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) index: u32) {
+    trace_slice(workgroup.x, index, 0u, 1u);
+}
+
+// Rays that go on: a lane has an item of the list that an earlier dispatch has left
+@compute @workgroup_size(64)
+fn resume(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) index: u32) {
+    let at = (batch.first + workgroup.x) * 64u + index;
+    if at < batch.items {
+        resume_item(items_in.list[at]);
+    }
+    add_counts(index);
+}

@@ -76,3 +76,13 @@ fn meet_leaves(lane: u32, size: u32) {
         }
     }
 }
+
+@compute @workgroup_size(64)
+fn trace(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(local_invocation_index) index: u32,
+    @builtin(subgroup_invocation_id) lane: u32,
+    @builtin(subgroup_size) size: u32,
+) {
+    trace_slice(workgroup.x, index, lane, size);
+}

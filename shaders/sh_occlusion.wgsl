@@ -11,7 +11,7 @@ struct Results {
     coefficients: array<f32>,
 }
 
-@group(1) @binding(6) var<storage, read_write> results: Results;
+@group(1) @binding(8) var<storage, read_write> results: Results;
 
 var<workgroup> products: array<f32, 2304>;
 var<workgroup> incomplete: atomic<u32>;
