@@ -162,7 +162,7 @@ fn visit(line: u32) {
     var opened = 0u;
     for (var slot = 0u; slot < boxes.count; slot++) {
         let child = child_box(boxes, slot);
-        let passes = pass(child);
+        let passes = passage(child);
         let sizes = seen(child);
         if passes.x > passes.y || (batch.is_limited != 0u && sizes.x > batch.reach2) {
             continue;
@@ -205,7 +205,7 @@ fn enter_brick(line: u32, slot: u32, number: u32) {
         spill(number, WAITS_FOR_BRICK);
     } else if place == NOT_IN_CUT {
         let child = child_box(read_boxes(line), slot);
-        meet_far_field(far_record(line, slot), child, pass(child));
+        meet_far_field(far_record(line, slot), child, passage(child));
     } else {
         visit(place + BRICK_HEADER_LINES);
     }

@@ -77,7 +77,7 @@ fn seen(child: ChildBox) -> vec2<f32> {
 }
 
 // Where the ray enters and leaves a child's box, padded against rounding
-fn pass(child: ChildBox) -> vec2<f32> {
+fn passage(child: ChildBox) -> vec2<f32> {
     let reach = max(abs(group_lower), abs(group_upper));
     let half = fused3(abs(child.center) + child.half + reach, vec3<f32>(BOX_ERROR), child.half);
     let steep = abs(ray_inverse);

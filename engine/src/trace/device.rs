@@ -1,4 +1,4 @@
-//! What traces: the name that `--device` takes, and what became of each batch.
+//! What traces: the name that `--device` takes.
 
 use std::fmt;
 use std::str::FromStr;
@@ -15,7 +15,7 @@ pub enum Device {
     Gpu(Option<u16>),
     /// A software adapter: slow, for tests.
     Software,
-    /// All real GPUs and the CPU.
+    /// All real GPUs, which share every batch.
     All,
 }
 

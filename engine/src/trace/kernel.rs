@@ -78,7 +78,8 @@ pub struct KernelRay<'a> {
 /// Traces a ray from the root of brick `root`, or goes on with an item.
 pub fn trace<B: Bricks>(bricks: &B, ray: KernelRay<'_>, from: Item, before: u32) -> Traced {
     let origins = &ray.bundle.origins;
-    let origin = origins.iter().find(|origin| ray.ray < usize::from(origin.end)).expect("a ray has an origin");
+    let origin =
+        origins.iter().find(|origin| ray.ray < usize::from(origin.end)).expect("a ray has an origin");
     let mut state = State {
         bricks,
         ray,
@@ -240,7 +241,8 @@ impl<B: Bricks> State<'_, B> {
         let leaf = &self.bricks.memory()[address..];
         let layout = Layout::read_trusted(leaf, self.node(node).lower_corner(slot));
         self.traced.bytes += layout.bytes as u64;
-        let faces = if layout.kind == Kind::Round { self.round(leaf, &layout) } else { self.flat(leaf, &layout) };
+        let faces =
+            if layout.kind == Kind::Round { self.round(leaf, &layout) } else { self.flat(leaf, &layout) };
         if faces == 0 {
             return;
         }

@@ -120,7 +120,9 @@ fn problem(limits: &Limits) -> Option<String> {
     )
     .or_else(|| small("bytes of a binding", limits.max_storage_buffer_binding_size, PAGE_BYTES_MIN))
     .or_else(|| small("bytes of a buffer", limits.max_buffer_size, PAGE_BYTES_MIN))
-    .or_else(|| small("bytes shared by a workgroup", limits.max_compute_workgroup_storage_size.into(), 12 << 10))
+    .or_else(|| {
+        small("bytes shared by a workgroup", limits.max_compute_workgroup_storage_size.into(), 12 << 10)
+    })
     .or_else(|| small("lanes of a workgroup", limits.max_compute_invocations_per_workgroup.into(), 64))
     .or_else(|| small("workgroups of a dispatch", limits.max_compute_workgroups_per_dimension.into(), 65_535))
 }
@@ -145,8 +147,6 @@ pub fn adapters() -> Vec<Adapter> {
 pub struct Choice {
     /// The adapters; without any the CPU traces.
     pub adapters: Vec<Adapter>,
-    /// Whether the CPU traces batches of its own beside them.
-    pub with_cpu: bool,
     /// One sentence on what was chosen and why.
     pub reason: String,
 }
@@ -163,23 +163,24 @@ pub fn choose(device: Device) -> Result<Choice> {
 }
 
 fn cpu(reason: &str) -> Choice {
-    Choice { adapters: Vec::new(), with_cpu: true, reason: reason.into() }
+    Choice { adapters: Vec::new(), reason: reason.into() }
 }
 
 /// [`choose`] among given adapters.
 fn choose_of(device: Device, all: Vec<Adapter>) -> Result<Choice> {
-    let nothing = if all.is_empty() { "no Vulkan driver was found" } else { "only software adapters were found" };
+    let nothing =
+        if all.is_empty() { "no Vulkan driver was found" } else { "only software adapters were found" };
     let of_kind = |software: bool| -> Vec<Adapter> {
         all.iter().filter(|a| (a.kind == AdapterKind::Software) == software).cloned().collect()
     };
     let real = of_kind(false);
     let able: Vec<Adapter> = real.iter().filter(|a| a.problem.is_none()).cloned().collect();
-    let first_problem = real.iter().find_map(|a| Some(format!("`{}` cannot trace: {}", a.name, a.problem.as_ref()?)));
+    let first_problem =
+        real.iter().find_map(|a| Some(format!("`{}` cannot trace: {}", a.name, a.problem.as_ref()?)));
     let none = first_problem.clone().unwrap_or_else(|| nothing.into());
     let one = |adapter: Adapter, why: &str| Choice {
         reason: format!("{}: {why}", adapter.title()),
         adapters: vec![adapter],
-        with_cpu: false,
     };
     match device {
         Device::Cpu => Ok(cpu("the CPU was asked for")),
@@ -204,14 +205,10 @@ fn choose_of(device: Device, all: Vec<Adapter>) -> Result<Choice> {
             None => Err(missing("no software adapter was found", false)
                 .hint("install one, for example Debian's mesa-vulkan-drivers and libvulkan1")),
         },
-        Device::All => Ok(Choice {
-            reason: match able.len() {
-                0 => format!("the CPU traces, since {none}"),
-                count => format!("{count} GPUs and the CPU"),
-            },
-            adapters: able,
-            with_cpu: true,
-        }),
+        Device::All if able.is_empty() => Err(missing(&none, first_problem.is_some())),
+        Device::All => {
+            Ok(Choice { reason: format!("all {} GPUs were asked for", able.len()), adapters: able })
+        }
     }
 }
 
@@ -232,9 +229,8 @@ mod tests {
             adapters().into_iter().filter(|a| a.kind == AdapterKind::Software).collect();
         for list in [software.clone(), Vec::new()] {
             let auto = choose_of(Device::Auto, list.clone()).unwrap();
-            assert!(auto.adapters.is_empty() && auto.with_cpu, "{}", auto.reason);
-            assert!(choose_of(Device::All, list.clone()).unwrap().adapters.is_empty());
-            for device in [Device::Gpu(None), Device::Gpu(Some(0))] {
+            assert!(auto.adapters.is_empty(), "{}", auto.reason);
+            for device in [Device::Gpu(None), Device::Gpu(Some(0)), Device::All] {
                 assert_eq!(choose_of(device, list.clone()).unwrap_err().kind(), ErrorKind::NotFound);
             }
             assert_eq!(choose_of(Device::Software, list.clone()).is_ok(), !list.is_empty());

@@ -85,7 +85,8 @@ impl Gpu {
         let scopes = [ErrorFilter::Validation, ErrorFilter::OutOfMemory, ErrorFilter::Internal]
             .map(|filter| self.device.push_error_scope(filter));
         let result = work(&self.device);
-        let mut errors = scopes.into_iter().rev().filter_map(|scope| ready(scope.pop()).flatten()).collect::<Vec<_>>();
+        let mut errors =
+            scopes.into_iter().rev().filter_map(|scope| ready(scope.pop()).flatten()).collect::<Vec<_>>();
         match errors.pop() {
             None if self.is_lost() => Err(self.gone()),
             None => Ok(result),

@@ -1,8 +1,8 @@
 //! Compiled kernels and what they are bound to.
 
 use wgpu::{
-    BindGroup, BindGroupLayout, BindGroupLayoutEntry, BindingType, Buffer, BufferBindingType, ComputePipeline,
-    ShaderStages,
+    BindGroup, BindGroupLayout, BindGroupLayoutEntry, BindingType, Buffer, BufferBindingType,
+    ComputePipeline, ShaderStages,
 };
 
 use super::device::Gpu;
@@ -94,7 +94,13 @@ impl Kernels {
         self.bind(gpu, "batch", &self.batch, buffers)
     }
 
-    fn bind(&self, gpu: &Gpu, label: &str, layout: &BindGroupLayout, buffers: &[&Buffer]) -> Result<BindGroup> {
+    fn bind(
+        &self,
+        gpu: &Gpu,
+        label: &str,
+        layout: &BindGroupLayout,
+        buffers: &[&Buffer],
+    ) -> Result<BindGroup> {
         let entries: Vec<_> = (0..)
             .zip(buffers)
             .map(|(binding, buffer)| wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() })

@@ -15,13 +15,15 @@ pub const LANES: u32 = 64;
 /// The records of some pieces of a batch.
 #[derive(Debug, Default)]
 pub struct PointRecords {
+    /// A record a point, in order.
     pub points: Vec<PointRecord>,
+    /// A record for the points that decide together.
     pub groups: Vec<GroupRecord>,
 }
 
 impl PointRecords {
     /// The records of `pieces`, whole points.
-    pub fn new(points: &[Point], shading: &Shading, setup: &Setup, pieces: Range<usize>) -> Self {
+    pub(super) fn new(points: &[Point], shading: &Shading, setup: &Setup, pieces: Range<usize>) -> Self {
         let mut records = Self::default();
         for piece in &setup.pieces[pieces] {
             // A point of very many samples has several pieces with the same origin
@@ -61,7 +63,7 @@ impl PointRecords {
 }
 
 /// The numbers of a batch of `points` points; dispatches set `first` and `items`.
-pub fn batch_record(shading: &Shading, setup: &Setup, root: u32, points: u32) -> BatchRecord {
+pub(super) fn batch_record(shading: &Shading, setup: &Setup, root: u32, points: u32) -> BatchRecord {
     let samples = shading.shader.samples;
     let is_limited = setup.reach.is_finite();
     BatchRecord {
@@ -83,10 +85,15 @@ pub fn batch_record(shading: &Shading, setup: &Setup, root: u32, points: u32) ->
     }
 }
 
-/// What depends on the number of samples alone: angles, order, limits, transmittances.
-pub fn tables(sampler: &Sampler) -> Vec<u32> {
+/// What depends on the number of samples alone: angles, order, limits, transmittances. Without `is_coherent` the order is
+/// the samples' own.
+pub fn tables(sampler: &Sampler, is_coherent: bool) -> Vec<u32> {
     let mut words: Vec<u32> = bytemuck::cast_slice(sampler.turns()).to_vec();
-    words.extend(coherent_order(sampler));
+    if is_coherent {
+        words.extend(coherent_order(sampler));
+    } else {
+        words.extend(0..sampler.samples());
+    }
     words.extend_from_slice(sampler.limits());
     words.extend(sampler.fractions().iter().map(|fraction| fraction.to_bits()));
     words
@@ -149,7 +156,9 @@ mod tests {
                 let groups = order.chunks_exact(32);
                 let count = groups.len() as f32;
                 let wide: f32 = groups
-                    .map(|group| group.iter().map(|&i| direction(i).distance(direction(group[0]))).fold(0.0, f32::max))
+                    .map(|group| {
+                        group.iter().map(|&i| direction(i).distance(direction(group[0]))).fold(0.0, f32::max)
+                    })
                     .sum();
                 assert!(wide / count < 4.0 * radius, "{samples}: {} {radius}", wide / count);
             }

@@ -1,5 +1,7 @@
 //! The records that host and kernels share. A test compares every offset with the shaders'.
 
+#![expect(missing_docs, reason = "the shaders say what the members mean")]
+
 use bytemuck::{Pod, Zeroable};
 
 /// A batch's numbers: `Batch` in `shaders/batch.wgsl`, which says what they mean.

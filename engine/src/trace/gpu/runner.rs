@@ -48,7 +48,8 @@ impl Outcome {
 
     /// Whether every one of `points` points is complete.
     pub fn is_complete(&self, points: usize) -> bool {
-        (0..points).all(|point| self.coverage.get(point / 32).is_some_and(|word| word >> (point % 32) & 1 != 0))
+        (0..points)
+            .all(|point| self.coverage.get(point / 32).is_some_and(|word| word >> (point % 32) & 1 != 0))
     }
 }
 
@@ -61,6 +62,8 @@ pub struct Runner {
     resume_pace: Pace,
     /// Children that a ray visits in one dispatch.
     pub steps_max: u32,
+    /// Whether neighbouring lanes trace neighbouring directions; set before the first run.
+    pub is_coherent: bool,
     /// Items that there is room for, instead of as many as rays.
     pub items_max: Option<u64>,
 }
@@ -114,6 +117,7 @@ impl Runner {
             trace_pace: Pace::default(),
             resume_pace: Pace::default(),
             steps_max: STEPS_MAX,
+            is_coherent: true,
             items_max: None,
         })
     }
@@ -278,7 +282,8 @@ impl Runner {
             let old = self.memory.take().map_or([0; 3], |memory| [memory.points, memory.rays, memory.values]);
             let sizes = [points.max(old[0]), rays.max(old[1]), values.max(old[2])];
             let items = self.items_max.unwrap_or(sizes[1].max(ITEMS_MIN));
-            let memory = Memory::new(gpu, mirror, &self.kernels, sizes, items, run.sampler)?;
+            let memory =
+                Memory::new(gpu, mirror, &self.kernels, sizes, items, run.sampler, self.is_coherent)?;
             outcome.sent_bytes += memory.tables.size();
             self.memory = Some(Arc::new(memory));
         }
@@ -312,13 +317,15 @@ impl Memory {
         [points, rays, values]: [u64; 3],
         items: u64,
         sampler: &Sampler,
+        is_coherent: bool,
     ) -> Result<Self> {
         let storage = |label: &str, bytes: u64| gpu.buffer(label, bytes, BufferUsages::STORAGE);
         let list_bytes = ITEMS_HEADER_BYTES + items * size_of::<ItemRecord>() as u64;
         let result_bytes = 4 * (COVERAGE_WORDS as u64 + values);
         let record = gpu.buffer("record", size_of::<BatchRecord>() as u64, BufferUsages::UNIFORM)?;
-        let (point_records, group_records) = (storage("points", 48 * points)?, storage("groups", 48 * points)?);
-        let words = tables(sampler);
+        let (point_records, group_records) =
+            (storage("points", 48 * points)?, storage("groups", 48 * points)?);
+        let words = tables(sampler, is_coherent);
         let tables = storage("tables", 4 * words.len() as u64)?;
         gpu.queue.write_buffer(&tables, 0, bytemuck::cast_slice(&words));
         let ray_results = storage("rays", 8 * rays)?;

@@ -74,8 +74,11 @@ impl Pages {
         if self.count > 1 {
             writeln!(text, "    switch at >> {shift}u {{").expect("strings take everything");
             for page in 1..self.count {
-                writeln!(text, "        case {page}u: {{\n            return page{page}[at & {mask}u];\n        }}")
-                    .expect("strings take everything");
+                writeln!(
+                    text,
+                    "        case {page}u: {{\n            return page{page}[at & {mask}u];\n        }}"
+                )
+                .expect("strings take everything");
             }
             text.push_str("        default: {}\n    }\n");
         }

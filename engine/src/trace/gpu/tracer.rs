@@ -14,8 +14,8 @@ use super::points::{PointRecords, batch_record};
 use super::records::ItemRecord;
 use super::runner::{Outcome, Run, Runner};
 use crate::batch::Point;
-use crate::cut::arena::{ArenaCounts, Changes};
 use crate::cut::Arena;
+use crate::cut::arena::{ArenaCounts, Changes};
 use crate::trace::setup::{Prepared, Setup, Shading};
 use crate::trace::stream::{BatchCounts, SphericalTracer, load_waiting};
 use crate::{Error, ErrorKind, Result};
@@ -76,8 +76,10 @@ impl GpuTracer {
     /// As [`new`](Self::new).
     pub fn with_pages(mut cpu: SphericalTracer, gpus: Vec<Gpu>, page_bytes_max: u64) -> Result<Self> {
         let wide = gpus.iter().all(|gpu| gpu.dialect.wide);
-        let lanes: Vec<Lane> =
-            gpus.into_iter().map(|gpu| Lane::new(gpu, cpu.arena_mut(), page_bytes_max)).collect::<Result<_>>()?;
+        let lanes: Vec<Lane> = gpus
+            .into_iter()
+            .map(|gpu| Lane::new(gpu, cpu.arena_mut(), page_bytes_max))
+            .collect::<Result<_>>()?;
         Ok(Self { cpu, lanes, wide, page_bytes_max, prepared: None, troubles: Vec::new() })
     }
 
@@ -321,7 +323,8 @@ fn share(
 fn halves(setup: &Setup, count: usize) -> Vec<Range<usize>> {
     let pieces = &setup.pieces;
     // All pieces of one point stay together
-    let whole = |piece: usize| (piece..pieces.len()).find(|&p| pieces[p].samples.start == 0).unwrap_or(pieces.len());
+    let whole =
+        |piece: usize| (piece..pieces.len()).find(|&p| pieces[p].samples.start == 0).unwrap_or(pieces.len());
     let mut parts = vec![0..pieces.len()];
     while parts.len() < count {
         let (largest, part) =
