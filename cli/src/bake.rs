@@ -7,6 +7,7 @@ use engine::bake::{BakeOptions, bake};
 use engine::brickmap::FarField;
 use engine::cut::Lod;
 use engine::stats::{BakeSetReport, Report};
+use engine::trace::Device;
 use engine::{Error, ErrorKind, Result, scene};
 
 use crate::console::{Answer, Console};
@@ -22,8 +23,9 @@ pub struct Arguments {
     /// The folder of the results; made if it is not there
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// What traces: auto or cpu
-    #[arg(long, default_value = "auto", value_parser = Device::parse)]
+    /// What traces: cpu, gpu[:N] (see `pantaray devices`), all (every GPU shares each batch), software (a slow adapter
+    /// for tests), or auto, which is the best GPU and the CPU where there is none
+    #[arg(long, default_value = "auto", value_parser = str::parse::<Device>)]
     device: Device,
     #[command(flatten)]
     resources: Resources,
@@ -72,9 +74,9 @@ impl Resources {
 
 /// Bakes and says how it went.
 pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
-    arguments.device.check()?;
     let scene = scene::load_frame(&arguments.scene, arguments.frame)?;
     let options = BakeOptions {
+        device: arguments.device,
         lod: arguments.lod,
         far_field: arguments.farfield.check()?,
         seed: arguments.seed,
@@ -170,34 +172,6 @@ fn describe_set(set: &BakeSetReport) -> String {
     )
 }
 
-/// What traces.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum Device {
-    Cpu,
-    /// Known to the grammar, not to this version.
-    Later(String),
-}
-
-impl Device {
-    fn parse(text: &str) -> Result<Self, String> {
-        let gpu_number = text.strip_prefix("gpu:").is_some_and(|number| number.parse::<u16>().is_ok());
-        match text {
-            "auto" | "cpu" => Ok(Self::Cpu),
-            "gpu" | "software" | "all" => Ok(Self::Later(text.into())),
-            _ if gpu_number => Ok(Self::Later(text.into())),
-            _ => Err("expected `auto` or `cpu`".into()),
-        }
-    }
-
-    fn check(&self) -> Result<()> {
-        match self {
-            Self::Cpu => Ok(()),
-            Self::Later(name) => Err(Error::unsupported(format!("device `{name}` is not supported yet"))
-                .hint("use `--device cpu`, or leave it out")),
-        }
-    }
-}
-
 /// What stands in for what is not opened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Far {
@@ -232,21 +206,4 @@ fn parse_lod(text: &str) -> Result<Lod, String> {
         Some(hint) => format!("{error}, {hint}"),
         None => error.to_string(),
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Catches a device of the design that is taken for a typing error, and one that is ignored.
-    #[test]
-    fn devices_of_later_versions_are_refused_by_name() {
-        assert!(Device::parse("auto").unwrap().check().is_ok());
-        assert!(Device::parse("gpu:x").is_err());
-        for name in ["gpu", "gpu:1", "software", "all"] {
-            let error = Device::parse(name).unwrap().check().unwrap_err();
-            assert_eq!(error.kind(), ErrorKind::Unsupported);
-            assert!(error.message().contains(name));
-        }
-    }
 }

@@ -77,7 +77,7 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
         Command::Compare(arguments) => compare::run(arguments, console),
         Command::Relight(arguments) => relight::run(arguments, console),
         Command::Export(arguments) => export::run(arguments, console),
-        Command::Devices(arguments) => devices::run(arguments),
+        Command::Devices(arguments) => devices::run(arguments, console),
     }
 }
 

@@ -25,6 +25,8 @@ pub enum ErrorKind {
     Io,
     /// Another process holds what this one needs.
     Busy,
+    /// A GPU or its driver failed; the same work may succeed elsewhere.
+    Device,
     /// The caller asked the work to stop.
     Cancelled,
 }

@@ -40,6 +40,14 @@ pub struct BrickMapReport {
     pub micropolygons_per_second: f64,
     /// Whether it was there already.
     pub reused: bool,
+    /// Seconds of the pass that counts, of the one that fills, and of building the partitions.
+    pub phase_seconds: [f64; 3],
+    /// Partitions that were built each on its own.
+    pub partitions: u64,
+    /// Those of them that an interrupted build had left.
+    pub partitions_continued: u64,
+    /// Bytes of temporary data.
+    pub scratch_bytes: u64,
 }
 
 /// The tracing part of a report.
@@ -57,6 +65,14 @@ pub struct BakeReport {
     pub rays_per_second: f64,
     /// What traced.
     pub device: String,
+    /// Why it was this.
+    pub device_reason: String,
+    /// Batches that devices traced, once a shader.
+    pub device_batches: u64,
+    /// Batches that the CPU traced, once a shader: all without a device, those that a device failed at with one.
+    pub cpu_batches: u64,
+    /// Share of the seconds that the busiest device was at work.
+    pub device_busy_ratio: f64,
     /// The instruction set of the inner loops.
     pub instructions: String,
     /// Worker threads.

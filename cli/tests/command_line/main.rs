@@ -1,5 +1,7 @@
 //! The command line from outside: answers, exit codes, errors, and files that appear whole or not at all.
 
+#[cfg(unix)]
+mod building;
 mod command;
 #[cfg(unix)]
 mod interruption;

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::brickmap::is_unfinished;
 use crate::{Error, ErrorKind, Result};
 
 /// A bake's folder, locked until it is dropped.
@@ -93,7 +94,7 @@ impl Folder {
         write_atomically(&path, &bytes)
     }
 
-    /// Removes what only an unfinished bake needs.
+    /// Removes what only an unfinished bake needs, brick maps of other occluders that were not finished included.
     ///
     /// # Errors
     /// When something cannot be removed.
@@ -101,6 +102,13 @@ impl Folder {
         for name in ["sets", "import", "build"] {
             let path = self.path.join("work").join(name);
             if path.exists() {
+                std::fs::remove_dir_all(&path).map_err(|e| Error::io("remove", &path, e))?;
+            }
+        }
+        let maps = self.path.join("brickmap");
+        for entry in std::fs::read_dir(&maps).map_err(|e| Error::io("read", &maps, e))? {
+            let path = entry.map_err(|e| Error::io("read", &maps, e))?.path();
+            if is_unfinished(&path) {
                 std::fs::remove_dir_all(&path).map_err(|e| Error::io("remove", &path, e))?;
             }
         }

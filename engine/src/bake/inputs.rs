@@ -41,7 +41,9 @@ const SAVED_FILE: &str = "inputs.json";
 const SAVED_VERSION: u32 = 2;
 
 impl Inputs {
-    /// Imports the files of `scene` that are no microgrid streams into `folder`, and hashes everything.
+    /// Imports the files of `scene` that are no microgrid streams into `folder`, and takes the identity of everything. Of
+    /// microgrid streams only the block headers are read: their checksums stand for the rest, and are compared with it in
+    /// the first pass over it.
     ///
     /// # Errors
     /// When a file is broken or cannot be read.
@@ -232,7 +234,7 @@ impl MatrixSource for Matrices {
 /// Adds files, and where they stand, to a hash.
 fn hash_parts(parts: &Parts, hash: &mut Xxh3) -> Result<()> {
     for Part { file, copies } in &parts.parts {
-        hash_file(file, hash)?;
+        hash.update(&MgsReader::open(file)?.identity()?.to_le_bytes());
         if let Some(copies) = copies {
             copies.each_use(|matrix| hash.update(bytemuck::cast_slice(&matrix.to_cols_array())));
         }

@@ -101,6 +101,11 @@ pub(super) fn open_map(
     map_report.reused = built.is_none();
     if let Some(built) = built {
         map_report.seconds += start.elapsed().as_secs_f64();
+        let phases = [built.count_seconds, built.fill_seconds, built.build_seconds];
+        map_report.phase_seconds.iter_mut().zip(phases).for_each(|(sum, seconds)| *sum += seconds);
+        map_report.partitions += built.partitions as u64;
+        map_report.partitions_continued += built.continued_partitions as u64;
+        map_report.scratch_bytes += built.spilled_bytes;
         report.skipped.extend(built.skipped());
     }
     let map = BrickMap::open(&path)?;

@@ -27,6 +27,7 @@ use crate::cut::Lod;
 use crate::output::{Part, PartLog};
 use crate::scene::Scene;
 use crate::stats::{BakeSetReport, Report, peak_rss_bytes};
+use crate::trace::Device;
 use crate::{Error, ErrorKind, Result};
 
 /// Memory that is the least a bake can do with.
@@ -39,6 +40,8 @@ pub struct BakeOptions {
     pub memory_bytes: u64,
     /// Worker threads.
     pub threads: usize,
+    /// What traces.
+    pub device: Device,
     /// How far to open the brick map.
     pub lod: Lod,
     /// What stands in for what is not opened.
@@ -60,6 +63,7 @@ impl Default for BakeOptions {
         Self {
             memory_bytes: 1 << 30,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
+            device: Device::default(),
             lod: Lod::Off,
             far_field: FarField::Paper,
             seed: 0,
@@ -154,6 +158,7 @@ pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Contro
 
     // Report
     report.bake = work.report(options);
+    report.warnings.extend_from_slice(work.troubles());
     report.bake.points = report.bake_sets.iter().map(|set| set.points).sum();
     write_report(&mut report, start, target)?;
     Ok(report)
@@ -249,6 +254,7 @@ fn trace(
     let mut tracer = set.tracer(plan.clone(), map)?;
     let mut part = Part::default();
     for (done, &batch) in todo.iter().enumerate() {
+        tracer.expect(todo.get(done + 1).copied())?;
         tracer.trace(batch, &mut part, work, control.cancel)?;
         log.append(&part)?;
         let rate = work.rays as f64 / work.seconds.max(1e-9) / 1e6;

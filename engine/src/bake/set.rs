@@ -14,11 +14,10 @@ use super::work::BakeWork;
 use super::{BakeOptions, Control};
 use crate::batch::{BatchPlan, KeepAll, Point, RAYS_PER_BATCH_MAX, SplitOptions, evenly_spaced, split};
 use crate::brickmap::BrickMap;
-use crate::cut::{Arena, Lod};
 use crate::output::{MergeOptions, MergeReport, Part, PartFormat, PartSource, merge};
 use crate::scene::{BakeSet, Scene, Shader, ShaderKind};
 use crate::stream::Attribute;
-use crate::trace::{Shading, SphericalTracer, TraceOptions};
+use crate::trace::{Backend, Shading, TraceOptions};
 use crate::{Error, Result};
 
 /// A bake set with everything that its results depend on.
@@ -129,10 +128,11 @@ impl<'a> SetBake<'a> {
             instructions: self.options.instructions,
         };
         let arena_bytes = arena_bytes(self.options, &map);
-        let arena = Arena::new(map, arena_bytes, self.options.lod == Lod::Off)?;
-        let tracer = SphericalTracer::new(arena, options, self.scene.meters_per_unit);
+        let device = self.options.device;
+        let backend = Backend::new(device, map, arena_bytes, options, self.scene.meters_per_unit)?;
         let (format, values) = (self.format(&plan)?, vec![Vec::new(); shadings.len()]);
-        Ok(BatchTracer { plan, shadings, format, tracer, points: Vec::new(), values, row: Vec::new() })
+        let (points, next_points, row) = Default::default();
+        Ok(BatchTracer { plan, shadings, format, backend, points, next: None, next_points, values, row })
     }
 
     /// Merges parts into the decorated stream `target`, which appears when it is complete. `scratch` is an existing
@@ -214,8 +214,11 @@ pub struct BatchTracer {
     plan: Arc<BatchPlan>,
     shadings: Vec<Shading>,
     format: PartFormat,
-    tracer: SphericalTracer,
+    backend: Backend,
     points: Vec<Point>,
+    /// The batch whose points are the next ones.
+    next: Option<u32>,
+    next_points: Vec<Point>,
     values: Vec<Vec<f32>>,
     row: Vec<f32>,
 }
@@ -224,6 +227,18 @@ impl BatchTracer {
     /// What the parts have in common.
     pub fn format(&self) -> &PartFormat {
         &self.format
+    }
+
+    /// Says which batch is traced after the coming one, so that its bricks can be loaded meanwhile.
+    ///
+    /// # Errors
+    /// When the plan is damaged.
+    pub fn expect(&mut self, next: Option<u32>) -> Result<()> {
+        self.next = next;
+        match next {
+            Some(batch) => self.plan.read(batch as usize, &mut self.next_points),
+            None => Ok(()),
+        }
     }
 
     /// Traces `batch`, becomes its part, and adds to `work`. The part depends on the batch alone.
@@ -239,9 +254,13 @@ impl BatchTracer {
     ) -> Result<()> {
         let start = Instant::now();
         self.plan.read(batch as usize, &mut self.points)?;
-        for (shading, values) in self.shadings.iter().zip(&mut self.values) {
+        for (number, (shading, values)) in self.shadings.iter().zip(&mut self.values).enumerate() {
             values.resize(self.points.len() * shading.coefficients(), 0.0);
-            work.add(&self.tracer.trace(&self.points, shading, cancel, values)?);
+            let next = match self.shadings.get(number + 1) {
+                Some(shading) => Some((&self.points[..], shading)),
+                None => self.next.map(|_| (&self.next_points[..], &self.shadings[0])),
+            };
+            work.add(&self.backend.trace(&self.points, shading, next, cancel, values)?);
         }
         part.start(batch, self.points.iter().map(|point| point.index), &self.format);
         for point in 0..self.points.len() {
@@ -259,7 +278,7 @@ impl BatchTracer {
 
     /// Adds to `work` what the arena has done since the tracer was made.
     pub fn finish(&self, work: &mut BakeWork) {
-        work.add_arena(&self.tracer);
+        work.add_backend(&self.backend);
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::BakeOptions;
 use crate::stats::BakeReport;
-use crate::trace::{BatchCounts, SphericalTracer};
+use crate::trace::{Backend, BatchCounts};
 
 /// What all bake sets together took.
 #[derive(Debug, Default)]
@@ -17,6 +17,12 @@ pub struct BakeWork {
     requests: u64,
     misses: u64,
     read_bytes: u64,
+    /// Batches and shaders that devices traced; the CPU traced the others.
+    device_batches: u64,
+    cpu_batches: u64,
+    device: String,
+    reason: String,
+    troubles: Vec<String>,
 }
 
 impl BakeWork {
@@ -25,13 +31,27 @@ impl BakeWork {
         self.counts.walk += counts.walk;
         self.counts.cut_bytes += counts.cut_bytes;
         self.counts.select_seconds += counts.select_seconds;
+        self.counts.device_bytes += counts.device_bytes;
+        self.counts.device_seconds += counts.device_seconds;
+        *(if counts.is_device { &mut self.device_batches } else { &mut self.cpu_batches }) += 1;
     }
 
-    pub(super) fn add_arena(&mut self, tracer: &SphericalTracer) {
-        let counts = tracer.arena_counts();
+    /// What went wrong with devices.
+    pub fn troubles(&self) -> &[String] {
+        &self.troubles
+    }
+
+    pub(super) fn add_backend(&mut self, backend: &Backend) {
+        let counts = backend.arena_counts();
         self.requests += counts.requests;
         self.misses += counts.misses;
         self.read_bytes += counts.read_bytes;
+        (self.device, self.reason) = (backend.name.clone(), backend.reason.clone());
+        for trouble in backend.troubles() {
+            if !self.troubles.contains(trouble) {
+                self.troubles.push(trouble.clone());
+            }
+        }
     }
 
     /// The tracing part of a report.
@@ -43,7 +63,12 @@ impl BakeWork {
             batches: self.batches,
             seconds: self.seconds,
             rays_per_second: self.rays as f64 / self.seconds.max(1e-9),
-            device: "cpu".into(),
+            device: if self.device.is_empty() { "cpu".into() } else { self.device.clone() },
+            device_reason: self.reason.clone(),
+            device_batches: self.device_batches,
+            cpu_batches: self.cpu_batches,
+            device_bytes_per_ray: ratio(self.counts.device_bytes, self.rays),
+            device_busy_ratio: self.counts.device_seconds / self.seconds.max(1e-9),
             instructions: options.instructions.name().into(),
             threads: options.threads as u64,
             lod: options.lod.to_string(),

@@ -62,7 +62,8 @@ impl Lattice {
     /// clamped to the coordinate range.
     pub fn snap(&self, position: DVec3, shift: u8) -> IVec3 {
         let scale = exp2(-self.exponent - i32::from(shift));
-        let steps = (position * scale).round().as_i64vec3() << i32::from(shift);
+        let scaled = position * scale;
+        let steps = I64Vec3::new(rounded(scaled.x), rounded(scaled.y), rounded(scaled.z)) << i32::from(shift);
         let limit = I64Vec3::splat(i64::from(COORDINATE_MAX));
         (steps - self.origin).clamp(-limit, limit).as_ivec3()
     }
@@ -89,6 +90,14 @@ pub fn exponent_for_edge(edge: f64) -> i32 {
 /// `2^e` exactly, for -1022 <= e <= 1023.
 pub fn exp2(e: i32) -> f64 {
     f64::from_bits(((e + 1023) as u64) << 52)
+}
+
+/// `x.round() as i64`, without the call of a library that rounding is on processors of no particular kind.
+#[inline]
+fn rounded(x: f64) -> i64 {
+    let whole = x as i64;
+    let rest = x - whole as f64;
+    whole.saturating_add(i64::from(rest >= 0.5) - i64::from(rest <= -0.5))
 }
 
 fn floor_log2(x: f64) -> i32 {
@@ -118,6 +127,17 @@ mod tests {
             let p = DVec3::new(0.123_456, -2.7, 1.999);
             let moved = (lattice.position(lattice.snap(p, shift)) - p).abs().max_element();
             assert!(moved <= 0.5 * lattice.step() * exp2(i32::from(shift)), "{moved}");
+        }
+    }
+
+    /// Catches rounding that is not that of `round`: at halves, at the least number below one, and out of range.
+    #[test]
+    fn rounding_is_the_usual_one() {
+        let special = [0.0, 0.5, -0.5, 1.5, 2.5, -2.5, 0.499_999_999_999_999_94, 4_503_599_627_370_497.5];
+        let edges = [1e18, -1e18, 9.3e18, -9.3e18, f64::INFINITY, f64::NEG_INFINITY, f64::NAN];
+        let many = (0..10_000).map(|i| (f64::from(i) - 5000.0) * 0.01);
+        for x in special.into_iter().chain(special.map(|x| -x)).chain(edges).chain(many) {
+            assert_eq!(rounded(x), x.round() as i64, "{x}");
         }
     }
 

@@ -91,7 +91,7 @@ pub struct Node {
 const _: () = assert!(size_of::<Node>() == 128);
 
 /// A box on the lattice, both corners inside.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LatticeBox {
     /// Lower corner.
     pub min: IVec3,

@@ -47,6 +47,21 @@ impl Cells {
         }
     }
 
+    /// Adds what another table has counted. The cells come out as if one table had counted everything.
+    pub fn merge(&mut self, mut other: Self) {
+        while self.exponent < other.exponent {
+            self.coarsen();
+        }
+        while other.exponent < self.exponent {
+            other.coarsen();
+        }
+        // A sum of two tables fits the slots, since each is at most half full
+        other.slots.iter().filter(|cell| cell.count > 0).for_each(|cell| self.insert(cell.key, cell.count));
+        while self.occupied > CELLS_MAX {
+            self.coarsen();
+        }
+    }
+
     /// Cuts the cells into partitions of at most `micropolygons_max` each, where cells allow it, numbered along the k-d
     /// tree. Returns their counts.
     pub fn partition(&mut self, micropolygons_max: u64) -> Vec<u64> {
@@ -140,6 +155,14 @@ mod tests {
             .collect();
         let mut cells = Cells::new(-6);
         points.iter().for_each(|&point| cells.add(point, 3));
+        // The same by two tables of very different shares
+        let mut shares = [Cells::new(-6), Cells::new(-6)];
+        points.iter().enumerate().for_each(|(i, &point)| shares[usize::from(i % 1000 == 0)].add(point, 3));
+        let [mut merged, small] = shares;
+        assert!(small.exponent < merged.exponent);
+        merged.merge(small);
+        assert_eq!(merged.exponent, cells.exponent);
+        assert_eq!(merged.partition(50_000), cells.partition(50_000));
         let counts = cells.partition(50_000);
         assert_eq!(counts.iter().sum::<u64>(), 1_200_000);
         assert!(counts.iter().all(|&count| count <= 50_000) && counts.len() < 80, "{}", counts.len());

@@ -15,7 +15,7 @@ use crate::brick::leaf::{self, FACES_MAX, Face, OPAQUE};
 const SMALL_GRID_FACES: usize = 2 * FACES_MAX;
 
 /// What was left out of a partition.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Skipped {
     /// Faces of no area.
     pub degenerate: u64,

@@ -10,7 +10,6 @@
 //! complete. Every brick has its own checksum, the directory's is in the manifest.
 
 use std::fs::File;
-use std::io::Write;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
@@ -28,12 +27,13 @@ use crate::{Error, ErrorKind, Result};
 /// The version of bricks and map. Others are refused.
 pub const FORMAT_VERSION: u32 = 2;
 
-const SEGMENT_BYTES: u64 = 1 << 30;
+/// Bytes of a segment at most.
+pub(super) const SEGMENT_BYTES: u64 = 1 << 30;
 const LENGTH_BITS: u32 = 12;
 const _: () = assert!(BYTES_MAX / ALIGNMENT <= 1 << LENGTH_BITS);
 
 /// Bricks of a map at most: their numbers have 32 bits and some are set aside.
-const BRICKS_MAX: u64 = 0xffff_0000;
+pub(super) const BRICKS_MAX: u64 = 0xffff_0000;
 
 /// What `manifest.json` says.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -70,119 +70,8 @@ pub struct Manifest {
     pub nodes: u64,
 }
 
-/// Writes a brick map.
-#[derive(Debug)]
-pub struct MapWriter {
-    target: PathBuf,
-    temporary: PathBuf,
-    segment: Option<std::io::BufWriter<File>>,
-    offset: u64,
-    directory: Vec<u8>,
-    done: bool,
-}
-
-impl MapWriter {
-    /// Starts a map that will appear at `target`.
-    ///
-    /// # Errors
-    /// When the folder cannot be made.
-    pub fn create(target: &Path) -> Result<Self> {
-        let name = target.file_name().unwrap_or_default().to_string_lossy();
-        let temporary = target.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
-        if temporary.exists() {
-            std::fs::remove_dir_all(&temporary).map_err(|e| Error::io("remove", &temporary, e))?;
-        }
-        std::fs::create_dir_all(&temporary).map_err(|e| Error::io("create the folder", &temporary, e))?;
-        Ok(Self {
-            target: target.to_path_buf(),
-            temporary,
-            segment: None,
-            offset: 0,
-            directory: Vec::new(),
-            done: false,
-        })
-    }
-
-    /// Bricks written so far.
-    pub fn bricks(&self) -> u32 {
-        (self.directory.len() / 8) as u32
-    }
-
-    /// Writes bricks that lie one after the other in `bytes`.
-    ///
-    /// # Errors
-    /// When the disk is full or fails, or there are too many bricks.
-    pub fn write(&mut self, bytes: &[u8], lengths: &[u32]) -> Result<()> {
-        if (self.directory.len() / 8 + lengths.len()) as u64 > BRICKS_MAX {
-            return Err(Error::new(ErrorKind::Limit, format!("more than {BRICKS_MAX} bricks")));
-        }
-        let mut at = 0;
-        for &length in lengths {
-            let length = length as usize;
-            if self.offset % SEGMENT_BYTES + length as u64 > SEGMENT_BYTES {
-                self.offset = self.offset.next_multiple_of(SEGMENT_BYTES);
-            }
-            if self.offset.is_multiple_of(SEGMENT_BYTES) {
-                self.finish_segment()?;
-                let path = self.temporary.join(segment_name(self.offset / SEGMENT_BYTES));
-                let file = File::create(&path).map_err(|e| Error::io("create", &path, e))?;
-                self.segment = Some(std::io::BufWriter::with_capacity(1 << 20, file));
-            }
-            let entry = ((self.offset / ALIGNMENT as u64) << LENGTH_BITS) | (length / ALIGNMENT - 1) as u64;
-            self.directory.extend_from_slice(&entry.to_le_bytes());
-            let segment = self.segment.as_mut().expect("opened above");
-            segment.write_all(&bytes[at..at + length]).map_err(|e| Error::io("write", &self.target, e))?;
-            self.offset += length as u64;
-            at += length;
-        }
-        Ok(())
-    }
-
-    fn finish_segment(&mut self) -> Result<()> {
-        let Some(segment) = self.segment.take() else { return Ok(()) };
-        let sync = || segment.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all();
-        sync().map_err(|e| Error::io("write", &self.target, e))
-    }
-
-    /// Writes directory and manifest, and gives the map its name. `directory_hash` and `split.directory` are filled in.
-    ///
-    /// # Errors
-    /// When the disk is full or fails.
-    pub fn finish(mut self, mut manifest: Manifest) -> Result<Manifest> {
-        self.finish_segment()?;
-        manifest.directory_hash = format!("{:016x}", xxh3_64(&self.directory));
-        manifest.split.directory = self.directory.len() as u64;
-        let write = |name: &str, bytes: &[u8]| {
-            let path = self.temporary.join(name);
-            let mut file = File::create(&path)?;
-            file.write_all(bytes)?;
-            file.sync_all()
-        };
-        let json = serde_json::to_vec_pretty(&manifest).map_err(|e| Error::invalid(e.to_string()))?;
-        let publish = || {
-            write("directory", &self.directory)?;
-            write("manifest.json", &json)?;
-            if self.target.exists() {
-                std::fs::remove_dir_all(&self.target)?;
-            }
-            std::fs::rename(&self.temporary, &self.target)
-        };
-        publish().map_err(|e| Error::io("write", &self.target, e))?;
-        self.done = true;
-        Ok(manifest)
-    }
-}
-
-impl Drop for MapWriter {
-    fn drop(&mut self) {
-        if !self.done {
-            // Nothing sensible can be done about a failure here
-            _ = std::fs::remove_dir_all(&self.temporary);
-        }
-    }
-}
-
-fn segment_name(number: u64) -> String {
+/// The name of a segment's file.
+pub(super) fn segment_name(number: u64) -> String {
     format!("segment.{number:04}")
 }
 
@@ -344,8 +233,22 @@ impl BrickMap {
     }
 }
 
+/// Where a brick of `length` bytes goes after those that end at `offset`: bricks do not straddle segments.
+pub(super) fn place_after(offset: u64, length: u64) -> u64 {
+    if offset % SEGMENT_BYTES + length > SEGMENT_BYTES {
+        offset.next_multiple_of(SEGMENT_BYTES)
+    } else {
+        offset
+    }
+}
+
+/// The directory entry of a brick.
+pub(super) fn entry(offset: u64, length: u32) -> u64 {
+    ((offset / ALIGNMENT as u64) << LENGTH_BITS) | (length as usize / ALIGNMENT - 1) as u64
+}
+
 /// Offset and length in bytes of a directory entry.
-fn place(entry: u64) -> (u64, u64) {
+pub(super) fn place(entry: u64) -> (u64, u64) {
     let length = (entry & ((1 << LENGTH_BITS) - 1)) + 1;
     ((entry >> LENGTH_BITS) * ALIGNMENT as u64, length * ALIGNMENT as u64)
 }

@@ -14,7 +14,7 @@ use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble, leaf};
 const TREELET_BYTES: usize = 12 << 10;
 
 /// What a primitive of the tree is.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub enum Content {
     /// A leaf, by its place among the encoded leaves.
     Leaf {
@@ -28,7 +28,7 @@ pub enum Content {
 }
 
 /// What a tree is built over: a leaf, or, at the top level, the root brick of a partition.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Primitive {
     /// Its box.
     pub bounds: LatticeBox,

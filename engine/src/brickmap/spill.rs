@@ -1,7 +1,6 @@
-//! The spill: quantised microgrids on local disk, appended to one log and found again by partition.
+//! What is spilled: quantised microgrids as records.
 //!
-//! A partition is a list of blocks in the log. Records are packed, not compressed: coordinates do not compress, and the
-//! disk is faster than the compressor. The log has no name once it is open, so nothing is left behind whatever happens.
+//! Records are packed, not compressed: coordinates do not compress, and the disk is faster than the compressor.
 //!
 //! ```text
 //! record  vertices - 1  u8      faces  u16      shift  u8
@@ -14,13 +13,7 @@
 //!         radii         f32 per vertex in lattice steps, if flagged
 //! ```
 
-use std::fs::File;
-use std::os::unix::fs::FileExt;
-use std::path::Path;
-
 use glam::IVec3;
-
-use crate::{Error, ErrorKind, Result};
 
 const SHORT: u8 = 1;
 const REGULAR: u8 = 2;
@@ -84,7 +77,8 @@ impl Quantised {
         }
     }
 
-    fn encode(&self, out: &mut Vec<u8>) {
+    /// Appends the grid as a record.
+    pub fn encode(&self, out: &mut Vec<u8>) {
         let low = self.vertices.iter().fold(IVec3::MAX, |low, &v| low.min(v));
         let high = self.vertices.iter().fold(IVec3::MIN, |high, &v| high.max(v));
         let short = (high - low).max_element() < 1 << 16;
@@ -97,12 +91,17 @@ impl Quantised {
         out.extend_from_slice(&(self.arities.len() as u16).to_le_bytes());
         out.extend_from_slice(&[self.shift, flags, self.columns]);
         low.to_array().iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
-        for &vertex in &self.vertices {
-            let relative = (vertex - low).to_array();
-            if short {
-                relative.iter().for_each(|&c| out.extend_from_slice(&(c as u16).to_le_bytes()));
-            } else {
-                relative.iter().for_each(|&c| out.extend_from_slice(&(c as u32).to_le_bytes()));
+        let start = out.len();
+        if short {
+            out.resize(start + 6 * self.vertices.len(), 0);
+            for (bytes, &vertex) in out[start..].as_chunks_mut::<6>().0.iter_mut().zip(&self.vertices) {
+                let [x, y, z] = (vertex - low).to_array().map(|c| (c as u16).to_le_bytes());
+                *bytes = [x[0], x[1], y[0], y[1], z[0], z[1]];
+            }
+        } else {
+            out.resize(start + 12 * self.vertices.len(), 0);
+            for (bytes, &vertex) in out[start..].as_chunks_mut::<12>().0.iter_mut().zip(&self.vertices) {
+                bytes.copy_from_slice((vertex - low).to_array().map(i32::to_le_bytes).as_flattened());
             }
         }
         if self.columns == 0 {
@@ -115,7 +114,7 @@ impl Quantised {
 
     /// Reads a record that [`encode`](Self::encode) wrote, and returns what follows it. The log is private and
     /// without a name, so only this process can have written it.
-    fn decode<'a>(&mut self, bytes: &'a [u8]) -> &'a [u8] {
+    pub fn decode<'a>(&mut self, bytes: &'a [u8]) -> &'a [u8] {
         self.clear();
         let vertices = usize::from(bytes[0]) + 1;
         let faces = usize::from(u16::from_le_bytes([bytes[1], bytes[2]]));
@@ -169,121 +168,12 @@ impl Quantised {
     }
 }
 
-/// Where a block of a partition lies in the log.
-#[derive(Clone, Copy, Debug)]
-struct Block {
-    offset: u64,
-    bytes: u32,
-}
-
-/// The log and its partitions.
-#[derive(Debug)]
-pub struct Spill {
-    file: File,
-    written: u64,
-    block_bytes: usize,
-    buffers: Vec<Vec<u8>>,
-    blocks: Vec<Vec<Block>>,
-    folder: std::path::PathBuf,
-}
-
-impl Spill {
-    /// An empty log in `folder` for `partitions`, with buffers of `memory_bytes` together.
-    ///
-    /// # Errors
-    /// When the log cannot be made.
-    pub fn create(folder: &Path, partitions: usize, memory_bytes: u64) -> Result<Self> {
-        static NEXT: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(0);
-        let number = NEXT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-        let path = folder.join(format!("spill.{}.{number}", std::process::id()));
-        let io = |error| Error::io("create", &path, error);
-        std::fs::create_dir_all(folder).map_err(io)?;
-        let file = File::options().read(true).write(true).create_new(true).open(&path).map_err(io)?;
-        std::fs::remove_file(&path).map_err(io)?;
-        let block_bytes = (memory_bytes as usize / partitions.max(1)).clamp(16 << 10, 1 << 20);
-        Ok(Self {
-            file,
-            written: 0,
-            block_bytes,
-            buffers: vec![Vec::new(); partitions],
-            blocks: vec![Vec::new(); partitions],
-            folder: folder.to_path_buf(),
-        })
-    }
-
-    /// Bytes in the log.
-    pub fn bytes(&self) -> u64 {
-        self.written
-    }
-
-    /// Adds a grid to a partition.
-    ///
-    /// # Errors
-    /// When the disk is full or fails.
-    pub fn push(&mut self, partition: usize, grid: &Quantised) -> Result<()> {
-        grid.encode(&mut self.buffers[partition]);
-        if self.buffers[partition].len() >= self.block_bytes {
-            self.flush(partition)?;
-        }
-        Ok(())
-    }
-
-    /// Writes what is buffered and gives the buffers back.
-    ///
-    /// # Errors
-    /// When the disk is full or fails.
-    pub fn finish(&mut self) -> Result<()> {
-        (0..self.buffers.len()).try_for_each(|partition| self.flush(partition))?;
-        self.buffers = Vec::new();
-        Ok(())
-    }
-
-    fn flush(&mut self, partition: usize) -> Result<()> {
-        let buffer = &mut self.buffers[partition];
-        if buffer.is_empty() {
-            return Ok(());
-        }
-        self.file.write_all_at(buffer, self.written).map_err(|error| {
-            Error::io("write temporary data", &self.folder, error)
-                .hint("the folder needs about 20 bytes for every micropolygon of the occluders")
-        })?;
-        self.blocks[partition].push(Block { offset: self.written, bytes: buffer.len() as u32 });
-        self.written += buffer.len() as u64;
-        buffer.clear();
-        Ok(())
-    }
-
-    /// Calls `each` with every grid of a partition, in the order they came.
-    ///
-    /// # Errors
-    /// When the log cannot be read, and what `each` returns.
-    pub fn read(&self, partition: usize, mut each: impl FnMut(&Quantised) -> Result<()>) -> Result<()> {
-        let (mut grid, mut buffer) = (Quantised::default(), Vec::new());
-        for block in &self.blocks[partition] {
-            buffer.resize(block.bytes as usize, 0);
-            self.file
-                .read_exact_at(&mut buffer, block.offset)
-                .map_err(|error| Error::io("read temporary data", &self.folder, error))?;
-            let mut rest = &buffer[..];
-            while !rest.is_empty() {
-                rest = grid.decode(rest);
-                each(&grid)?;
-            }
-        }
-        Ok(())
-    }
-}
-
-/// The error of a build that was told to stop.
-pub fn cancelled() -> Error {
-    Error::new(ErrorKind::Cancelled, "the build was cancelled")
-}
-
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn sample(regular: bool, far: bool) -> Quantised {
+    /// A small grid, regular or of all sorts of faces, narrow or wide.
+    pub fn sample(regular: bool, far: bool) -> Quantised {
         let mut grid = Quantised { shift: 2, ..Quantised::default() };
         let scale = if far { 100_000 } else { 40 };
         grid.vertices = (0..12).map(|i| IVec3::new(i % 4, i / 4, i * i % 5) * scale - 70_000).collect();
@@ -302,28 +192,18 @@ mod tests {
         grid
     }
 
-    /// Catches a grid that changes on its way through the disk, or lands in another partition.
+    /// Catches a grid that changes on its way through the disk.
     #[test]
     fn grids_come_back_as_they_went() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut spill = Spill::create(folder.path(), 3, 0).unwrap();
         let grids = [sample(true, false), sample(false, false), sample(true, true), sample(false, true)];
         assert_eq!(grids.each_ref().map(|grid| grid.columns), [3, 0, 3, 0]);
-        for i in 0..2000 {
-            spill.push(i % 3, &grids[i % 4]).unwrap();
+        let (mut bytes, mut back) = (Vec::new(), Quantised::default());
+        grids.iter().for_each(|grid| grid.encode(&mut bytes));
+        let mut rest = &bytes[..];
+        for grid in &grids {
+            rest = back.decode(rest);
+            assert_eq!(back, *grid);
         }
-        spill.finish().unwrap();
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "the log should have no name");
-        for partition in 0..3 {
-            let mut i = partition;
-            spill
-                .read(partition, |grid| {
-                    assert_eq!(*grid, grids[i % 4]);
-                    i += 3;
-                    Ok(())
-                })
-                .unwrap();
-            assert!(i >= 2000);
-        }
+        assert!(rest.is_empty());
     }
 }

@@ -18,9 +18,9 @@ use crate::{Error, ErrorKind, Result};
 const NONE: u32 = u32::MAX;
 
 /// A place: in the cut, but not loaded.
-const MISSING: u32 = u32::MAX;
+pub const MISSING: u32 = u32::MAX;
 /// A place: not in the cut.
-const NOT_IN_CUT: u32 = u32::MAX - 1;
+pub const NOT_IN_CUT: u32 = u32::MAX - 1;
 
 /// Bytes that one read from storage asks for at most, when bricks are neighbours on disk.
 const READ_BYTES_MAX: usize = 1 << 20;
@@ -80,8 +80,19 @@ pub struct Arena {
     /// Per brick, what a walk asks for: its address, [`MISSING`] or [`NOT_IN_CUT`]. One look-up a brick.
     places: Vec<u32>,
     staging: Vec<u8>,
+    /// What was written, if somebody keeps a copy.
+    changes: Option<Changes>,
     /// What was counted.
     pub counts: ArenaCounts,
+}
+
+/// What has changed in an arena since a copy of it was last brought up to date.
+#[derive(Clone, Debug, Default)]
+pub struct Changes {
+    /// Ranges of memory in units of [`ALIGNMENT`], in any order, some of them more than once.
+    pub lines: Vec<std::ops::Range<u32>>,
+    /// Bricks whose place is another one, likewise.
+    pub places: Vec<u32>,
 }
 
 impl Arena {
@@ -126,6 +137,7 @@ impl Arena {
             cut: Vec::new(),
             places: vec![if everything { MISSING } else { NOT_IN_CUT }; bricks],
             staging: Vec::new(),
+            changes: None,
             map,
             counts: ArenaCounts::default(),
         })
@@ -136,11 +148,53 @@ impl Arena {
         &self.map
     }
 
+    /// From now on [`take_changes`](Self::take_changes) tells what has changed, first of all everything that is there.
+    pub fn track_changes(&mut self) {
+        let lines = if self.highest == NONE { Vec::new() } else { vec![0..self.end_of(self.highest)] };
+        self.changes = Some(Changes { lines, places: (0..self.map.brick_count()).collect() });
+    }
+
+    /// Nobody keeps a copy any more.
+    pub fn forget_changes(&mut self) {
+        self.changes = None;
+    }
+
+    /// What has changed since the last call; nothing unless changes are tracked.
+    pub fn take_changes(&mut self) -> Changes {
+        self.changes.as_mut().map(std::mem::take).unwrap_or_default()
+    }
+
+    /// Per brick, where it is in units of [`ALIGNMENT`]; [`MISSING`] or [`NOT_IN_CUT`].
+    pub fn places(&self) -> &[u32] {
+        &self.places
+    }
+
+    /// Bytes that it has for bricks.
+    pub fn bytes(&self) -> u64 {
+        u64::from(self.capacity) * ALIGNMENT as u64
+    }
+
     /// Starts a new batch with an empty cut: bricks loaded or touched from now on stay until the next one starts.
     pub fn begin_batch(&mut self) {
         self.batch += 1;
         for brick in std::mem::take(&mut self.cut) {
-            self.places[brick as usize] = NOT_IN_CUT;
+            self.set_place(brick, NOT_IN_CUT);
+        }
+    }
+
+    fn set_place(&mut self, brick: u32, place: u32) {
+        if self.places[brick as usize] != place {
+            self.places[brick as usize] = place;
+            if let Some(changes) = &mut self.changes {
+                changes.places.push(brick);
+            }
+        }
+    }
+
+    /// Notes that a brick's lines were written.
+    fn note_written(&mut self, at: u32, lines: u32) {
+        if let Some(changes) = &mut self.changes {
+            changes.lines.push(at..at + lines);
         }
     }
 
@@ -157,15 +211,14 @@ impl Arena {
         self.cut.extend_from_slice(bricks);
         for &brick in bricks {
             let slot = self.slot_of[brick as usize];
-            self.places[brick as usize] = if slot == NONE { MISSING } else { self.slots[slot as usize].at };
+            self.set_place(brick, if slot == NONE { MISSING } else { self.slots[slot as usize].at });
         }
     }
 
     /// Notes where a brick is now, if it is in the cut.
     fn note_place(&mut self, brick: u32, place: u32) {
-        let known = &mut self.places[brick as usize];
-        if *known != NOT_IN_CUT {
-            *known = place;
+        if self.places[brick as usize] != NOT_IN_CUT {
+            self.set_place(brick, place);
         }
     }
 
@@ -260,6 +313,7 @@ impl Arena {
             let place = self.place(lines);
             let start = place as usize * ALIGNMENT;
             self.memory[start..start + length].copy_from_slice(&staging[at..at + length]);
+            self.note_written(place, lines);
             self.insert(brick, place, lines);
             self.counts.misses += 1;
             at += length;
@@ -315,6 +369,7 @@ impl Arena {
                     (at as usize * ALIGNMENT, hole as usize * ALIGNMENT, length as usize * ALIGNMENT);
                 self.memory.copy_within(from..from + bytes, to);
                 self.slots[slot as usize].at = hole;
+                self.note_written(hole, length);
                 self.note_place(self.slots[slot as usize].brick, hole);
                 self.counts.moved_bytes += bytes as u64;
             }

@@ -56,6 +56,17 @@ impl Spread {
     }
 }
 
+/// How a point's directions are turned about its normal and shifted along it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rotation {
+    /// What everything else of the point is hashed from; itself the shift.
+    pub hash: u32,
+    /// Cosine of the angle about the normal.
+    pub cos: f32,
+    /// Its sine.
+    pub sin: f32,
+}
+
 /// Makes the rays of points, for a fixed number of samples.
 #[derive(Debug)]
 pub struct Sampler {
@@ -96,6 +107,28 @@ impl Sampler {
         self.samples
     }
 
+    /// How the directions of point `index` are turned.
+    pub fn rotation(&self, index: u64) -> Rotation {
+        let hash = combine(combine(self.key, index as u32), (index >> 32) as u32);
+        let (cos, sin) = cos_sin_turns(f64::from(unit_f32(hash32(hash ^ 0x68bc_21eb))));
+        Rotation { hash, cos: cos as f32, sin: sin as f32 }
+    }
+
+    /// Cosine and sine of every sample's angle, before a point's rotation.
+    pub fn turns(&self) -> &[[f32; 2]] {
+        &self.turns
+    }
+
+    /// The extinctions at which the rays of each stratum end.
+    pub fn limits(&self) -> &[u32] {
+        &self.limits
+    }
+
+    /// Transmittances of the extinctions below one octave.
+    pub fn fractions(&self) -> &[f32] {
+        &self.transmittances.fractions
+    }
+
     /// Adds the rays `range` of point `index` to the bundle's newest origin.
     pub fn push_rays(
         &self,
@@ -105,11 +138,9 @@ impl Sampler {
         range: std::ops::Range<u32>,
         bundle: &mut Bundle,
     ) {
-        let point = combine(combine(self.key, index as u32), (index >> 32) as u32);
-        let (shift, rotation) = (unit_f32(point), unit_f32(hash32(point ^ 0x68bc_21eb)));
-        let threshold = hash32(point ^ 0x02e5_be93);
-        let (cos, sin) = cos_sin_turns(f64::from(rotation));
-        let (cos, sin) = (cos as f32, sin as f32);
+        let Rotation { hash, cos, sin } = self.rotation(index);
+        let shift = unit_f32(hash);
+        let threshold = hash32(hash ^ 0x02e5_be93);
         let (tangent, bitangent) = frame(normal);
         let step = 1.0 / self.samples as f32;
         for i in range {
@@ -142,12 +173,17 @@ impl Sampler {
     }
 }
 
+/// The one quotient of [`frame`].
+pub fn frame_factor(normal: Vec3) -> f32 {
+    -1.0 / (1.0_f32.copysign(normal.z) + normal.z)
+}
+
 /// Two unit vectors that make a right-handed frame with the unit vector `normal`.
 ///
 /// Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
 fn frame(normal: Vec3) -> (Vec3, Vec3) {
     let sign = 1.0_f32.copysign(normal.z);
-    let a = -1.0 / (sign + normal.z);
+    let a = frame_factor(normal);
     let b = normal.x * normal.y * a;
     (
         Vec3::new(1.0 + sign * normal.x * normal.x * a, sign * b, -sign * normal.x),

@@ -120,17 +120,17 @@ pub trait Lanes {
     unsafe fn meet_planes(planes: &Planes, direction: &[f32; 4]) -> u16;
 }
 
-/// Of the triangles in `hits`, those that a ray meets within `reach` steps. Rare, so plain for all.
+/// Of the triangles in `hits`, those that a ray meets within `reach` steps. Rare, so plain for all; in the operations that
+/// decide whether it meets them at all.
 pub fn within(planes: &Planes, direction: &[f32; 4], hits: u16, reach: f32) -> u16 {
     let mut near = 0;
     for lane in (0..16).filter(|lane| hits >> lane & 1 != 0) {
         let edge = |e: usize| {
-            (0..3)
-                .map(|axis| f64::from(direction[axis]) * f64::from(planes.normals[e][axis][lane]))
-                .sum::<f64>()
+            let [x, y, z] = planes.normals[e].each_ref().map(|axis| axis[lane]);
+            direction[2].mul_add(z, direction[1].mul_add(y, direction[0] * x))
         };
         let sum = edge(0) + edge(1) + edge(2);
-        near |= u16::from(f64::from(planes.volume[lane]) <= f64::from(reach) * sum) << lane;
+        near |= u16::from(planes.volume[lane] <= reach * sum) << lane;
     }
     near
 }

@@ -1,9 +1,11 @@
 //! Several streams in a row under one schema.
 
+use std::sync::Arc;
+
 use half::f16;
 
 use crate::stream::schema::names;
-use crate::stream::{Attribute, Microgrid, MicrogridStream, Rate, Schema, ValueType, microgrid};
+use crate::stream::{Attribute, Microgrid, MicrogridStream, Piece, Rate, Schema, ValueType, microgrid};
 use crate::{Error, Result};
 
 /// Streams one after the other, with the union of their attributes.
@@ -14,18 +16,20 @@ use crate::{Error, Result};
 /// per grid and per vertex become per vertex. u32 beside a float is refused, since f32 cannot hold every u32.
 pub struct Concat {
     parts: Vec<Part>,
-    schema: Schema,
+    schema: Arc<Schema>,
     part: usize,
     scratch: Microgrid,
 }
 
 struct Part {
     stream: Box<dyn MicrogridStream>,
-    /// For every column of the merged schema, where it comes from.
-    sources: Vec<Source>,
+    sources: Arc<Sources>,
     /// Whether the stream's own schema is the merged one.
     identical: bool,
 }
+
+/// For every column of the merged schema, where it comes from.
+struct Sources(Vec<Source>);
 
 enum Source {
     /// The same type and rate.
@@ -63,10 +67,11 @@ impl Concat {
         let part = |stream: Box<dyn MicrogridStream>| {
             let own = stream.schema();
             let sources = schema.attributes.iter().map(|attribute| Source::of(attribute, own)).collect();
-            Part { identical: own.attributes == schema.attributes, sources, stream }
+            let identical = own.attributes == schema.attributes;
+            Part { identical, sources: Arc::new(Sources(sources)), stream }
         };
         let parts = streams.into_iter().map(part).collect();
-        Ok(Self { parts, schema, part: 0, scratch: Microgrid::default() })
+        Ok(Self { parts, schema: Arc::new(schema), part: 0, scratch: Microgrid::default() })
     }
 }
 
@@ -85,7 +90,7 @@ impl MicrogridStream for Concat {
             let target = if part.identical { &mut *grid } else { &mut self.scratch };
             if part.stream.next(target)? {
                 if !part.identical {
-                    part.merge(&mut self.scratch, &self.schema, grid);
+                    part.sources.merge(&mut self.scratch, &self.schema, grid);
                 }
                 return Ok(true);
             }
@@ -94,13 +99,51 @@ impl MicrogridStream for Concat {
         Ok(false)
     }
 
+    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        while let Some(part) = self.parts.get_mut(self.part) {
+            if let Some(inner) = part.stream.next_piece()? {
+                if part.identical {
+                    return Ok(Some(inner));
+                }
+                let (sources, schema) = (part.sources.clone(), self.schema.clone());
+                return Ok(Some(Box::new(MergedPiece { inner, sources, schema })));
+            }
+            self.part += 1;
+        }
+        Ok(None)
+    }
+
     fn progress(&self) -> f64 {
         let current = self.parts.get(self.part).map_or(0.0, |part| part.stream.progress());
         (self.part as f64 + current) / self.parts.len() as f64
     }
 }
 
-impl Part {
+/// A piece of one part, its grids brought to the merged schema.
+struct MergedPiece {
+    inner: Box<dyn Piece>,
+    sources: Arc<Sources>,
+    schema: Arc<Schema>,
+}
+
+impl Piece for MergedPiece {
+    fn read(
+        self: Box<Self>,
+        grid: &mut Microgrid,
+        each: &mut dyn FnMut(&Microgrid) -> Result<()>,
+    ) -> Result<()> {
+        let Self { inner, sources, schema } = *self;
+        let (mut decoded, mut copy) = (Microgrid::default(), Microgrid::default());
+        inner.read(&mut decoded, &mut |source| {
+            // Merging takes its source apart
+            copy.clone_from(source);
+            sources.merge(&mut copy, &schema, grid);
+            each(grid)
+        })
+    }
+}
+
+impl Sources {
     /// Moves a grid of the part's schema to one of the merged schema.
     fn merge(&self, from: &mut Microgrid, schema: &Schema, to: &mut Microgrid) {
         to.clear(schema.attributes.len());
@@ -109,7 +152,7 @@ impl Part {
         std::mem::swap(&mut to.arities, &mut from.arities);
         std::mem::swap(&mut to.indices, &mut from.indices);
         let vertices = to.positions.len();
-        for (index, source) in self.sources.iter().enumerate() {
+        for (index, source) in self.0.iter().enumerate() {
             let attribute = &schema.attributes[index];
             let values = if attribute.rate == Rate::Vertex { vertices } else { 1 };
             match source {

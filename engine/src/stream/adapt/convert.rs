@@ -2,10 +2,10 @@
 
 use glam::{DMat4, DVec3, DVec4};
 
-use super::place::{PlacedColumns, Placement};
+use super::place::{PlacedColumns, PlacedPiece, Placement};
 use crate::Result;
 use crate::stream::schema::UpAxis;
-use crate::stream::{Microgrid, MicrogridStream, Schema};
+use crate::stream::{Microgrid, MicrogridStream, Piece, Schema};
 
 /// A stream under one affine map: units, up axis, or any matrix.
 pub struct Convert<S> {
@@ -73,6 +73,14 @@ impl<S: MicrogridStream> MicrogridStream for Convert<S> {
             placement.apply(&self.scratch, &self.columns, grid)?;
         }
         Ok(more)
+    }
+
+    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        let (Some(inner), columns) = (self.inner.next_piece()?, self.columns) else { return Ok(None) };
+        Ok(Some(match self.placement {
+            Some(placement) => Box::new(PlacedPiece { inner, placement, columns, instance: None }),
+            None => inner,
+        }))
     }
 
     fn progress(&self) -> f64 {

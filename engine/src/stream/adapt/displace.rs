@@ -1,6 +1,8 @@
 //! The hook for displacement: a stream whose grids another stage moves.
 
-use crate::stream::{Microgrid, MicrogridStream, Schema};
+use std::sync::Arc;
+
+use crate::stream::{Microgrid, MicrogridStream, Piece, Schema};
 use crate::{Error, Result};
 
 /// Moves the vertices of grids; `shade` implements it.
@@ -18,7 +20,7 @@ impl<D: Displacement + ?Sized> Displacement for Box<D> {
     }
 }
 
-impl<D: Displacement + ?Sized> Displacement for std::sync::Arc<D> {
+impl<D: Displacement + ?Sized> Displacement for Arc<D> {
     fn displace(&self, grid: &mut Microgrid, schema: &Schema) -> Result<()> {
         (**self).displace(grid, schema)
     }
@@ -27,19 +29,21 @@ impl<D: Displacement + ?Sized> Displacement for std::sync::Arc<D> {
 /// A stream with every grid displaced.
 pub struct Displace<S, D> {
     inner: S,
-    displacement: D,
+    schema: Arc<Schema>,
+    displacement: Arc<D>,
 }
 
 impl<S: MicrogridStream, D: Displacement> Displace<S, D> {
     /// `inner`, displaced.
     pub fn new(inner: S, displacement: D) -> Self {
-        Self { inner, displacement }
+        let schema = Arc::new(inner.schema().clone());
+        Self { inner, schema, displacement: Arc::new(displacement) }
     }
 }
 
-impl<S: MicrogridStream, D: Displacement> MicrogridStream for Displace<S, D> {
+impl<S: MicrogridStream, D: Displacement + 'static> MicrogridStream for Displace<S, D> {
     fn schema(&self) -> &Schema {
-        self.inner.schema()
+        &self.schema
     }
 
     fn rewind(&mut self) -> Result<()> {
@@ -50,19 +54,53 @@ impl<S: MicrogridStream, D: Displacement> MicrogridStream for Displace<S, D> {
         if !self.inner.next(grid)? {
             return Ok(false);
         }
-        let counts = (grid.vertex_count(), grid.face_count());
-        self.displacement.displace(grid, self.inner.schema())?;
-        if counts != (grid.vertex_count(), grid.face_count()) {
-            return Err(Error::invalid("a displacement changed the number of vertices or faces"));
-        }
-        recenter(grid);
-        grid.validate(self.inner.schema())?;
+        displace(self.displacement.as_ref(), &self.schema, grid)?;
         Ok(true)
+    }
+
+    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        let Some(inner) = self.inner.next_piece()? else { return Ok(None) };
+        let (schema, displacement) = (self.schema.clone(), self.displacement.clone());
+        Ok(Some(Box::new(DisplacedPiece { inner, schema, displacement })))
     }
 
     fn progress(&self) -> f64 {
         self.inner.progress()
     }
+}
+
+/// A piece with every grid displaced.
+struct DisplacedPiece<D> {
+    inner: Box<dyn Piece>,
+    schema: Arc<Schema>,
+    displacement: Arc<D>,
+}
+
+impl<D: Displacement> Piece for DisplacedPiece<D> {
+    fn read(
+        self: Box<Self>,
+        grid: &mut Microgrid,
+        each: &mut dyn FnMut(&Microgrid) -> Result<()>,
+    ) -> Result<()> {
+        let mut decoded = Microgrid::default();
+        let Self { inner, schema, displacement } = *self;
+        inner.read(&mut decoded, &mut |source| {
+            grid.clone_from(source);
+            displace(displacement.as_ref(), &schema, grid)?;
+            each(grid)
+        })
+    }
+}
+
+/// Displaces a grid and checks what came of it.
+fn displace(displacement: &impl Displacement, schema: &Schema, grid: &mut Microgrid) -> Result<()> {
+    let counts = (grid.vertex_count(), grid.face_count());
+    displacement.displace(grid, schema)?;
+    if counts != (grid.vertex_count(), grid.face_count()) {
+        return Err(Error::invalid("a displacement changed the number of vertices or faces"));
+    }
+    recenter(grid);
+    grid.validate(schema)
 }
 
 /// Moves the anchor into a grid that has left it by more than its own size, so that offsets stay small and precise.

@@ -1,12 +1,15 @@
 //! Many copies of a stream, one after the other, in world space.
 
 use std::mem::size_of;
+use std::ops::Range;
+use std::sync::Arc;
 
 use glam::DMat4;
 
-use super::place::{PlacedColumns, Placement};
+use super::place::{InstanceNumber, PlacedColumns, PlacedPiece, Placement};
+use crate::stream::piece::PIECE_VERTICES;
 use crate::stream::schema::names;
-use crate::stream::{Attribute, Microgrid, MicrogridStream, Schema, ValueType};
+use crate::stream::{Attribute, Microgrid, MicrogridStream, Piece, Schema, ValueType};
 use crate::{Error, ErrorKind, Result};
 
 /// A prototype that needs at most this much memory is decoded once; a larger one is read again for every copy.
@@ -84,7 +87,7 @@ pub struct Instance<S, M> {
 
 /// What is known of the prototype's grids.
 struct Prototype {
-    grids: Vec<Microgrid>,
+    grids: Arc<Vec<Microgrid>>,
     bytes: usize,
     state: PrototypeState,
     next: usize,
@@ -178,13 +181,23 @@ impl<S: MicrogridStream, M: MatrixSource> MicrogridStream for Instance<S, M> {
             let Some(placement) = &self.placement else { unreachable!("a copy has begun") };
             if let Some(source) = self.prototype.next(&mut self.inner, &mut self.scratch)? {
                 placement.apply(source, &self.columns, grid)?;
-                grid.columns.resize_with(self.schema.attributes.len(), Vec::new);
-                let column = &mut grid.columns[self.instance_column];
-                column.clear();
-                column.extend_from_slice(&((self.copies - 1) as u32).to_le_bytes());
+                self.number().write(grid);
                 return Ok(true);
             }
             self.placement = None;
+        }
+    }
+
+    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        if self.prototype.state == PrototypeState::Filling {
+            while self.prototype.next(&mut self.inner, &mut self.scratch)?.is_some()
+                && self.prototype.state == PrototypeState::Filling
+            {}
+            self.inner.rewind()?;
+        }
+        match self.prototype.state {
+            PrototypeState::TooLarge => self.next_piece_of_inner(),
+            _ => self.next_copies(),
         }
     }
 
@@ -193,16 +206,87 @@ impl<S: MicrogridStream, M: MatrixSource> MicrogridStream for Instance<S, M> {
     }
 }
 
+impl<S: MicrogridStream, M: MatrixSource> Instance<S, M> {
+    /// The next piece of a prototype that is read again for every copy.
+    fn next_piece_of_inner(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        // Ends with the matrices, as `next` does
+        loop {
+            if self.placement.is_none() && !self.begin_copy()? {
+                return Ok(None);
+            }
+            if let (Some(placement), Some(inner)) = (self.placement, self.inner.next_piece()?) {
+                let instance = Some(self.number());
+                return Ok(Some(Box::new(PlacedPiece { inner, placement, columns: self.columns, instance })));
+            }
+            self.placement = None;
+        }
+    }
+
+    /// The next piece of a prototype in memory: several copies, or a part of one.
+    fn next_copies(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        let count = self.prototype.grids.len();
+        let mut copies =
+            Copies { grids: self.prototype.grids.clone(), columns: self.columns, copies: Vec::new() };
+        let mut vertices = 0;
+        while vertices < PIECE_VERTICES {
+            if self.placement.is_none() && (count == 0 || !self.begin_copy()?) {
+                break;
+            }
+            let Some(placement) = self.placement else { unreachable!("a copy has begun") };
+            // The rest of the copy, or what fills the piece
+            let from = self.prototype.next;
+            while self.prototype.next < count && vertices < PIECE_VERTICES {
+                vertices += self.prototype.grids[self.prototype.next].vertex_count();
+                self.prototype.next += 1;
+            }
+            copies.copies.push((placement, self.number(), from..self.prototype.next));
+            if self.prototype.next == count {
+                self.placement = None;
+            }
+        }
+        Ok((!copies.copies.is_empty()).then(|| Box::new(copies) as Box<dyn Piece>))
+    }
+
+    /// The number of the copy that is being made.
+    fn number(&self) -> InstanceNumber {
+        InstanceNumber { column: self.instance_column, number: (self.copies - 1) as u32 }
+    }
+}
+
+/// Copies of a prototype in memory, or parts of copies.
+struct Copies {
+    grids: Arc<Vec<Microgrid>>,
+    columns: PlacedColumns,
+    copies: Vec<(Placement, InstanceNumber, Range<usize>)>,
+}
+
+impl Piece for Copies {
+    fn read(
+        self: Box<Self>,
+        grid: &mut Microgrid,
+        each: &mut dyn FnMut(&Microgrid) -> Result<()>,
+    ) -> Result<()> {
+        for (placement, number, range) in &self.copies {
+            for source in &self.grids[range.clone()] {
+                placement.apply(source, &self.columns, grid)?;
+                number.write(grid);
+                each(grid)?;
+            }
+        }
+        Ok(())
+    }
+}
+
 impl Prototype {
     fn new() -> Self {
-        Self { grids: Vec::new(), bytes: 0, state: PrototypeState::Filling, next: 0 }
+        Self { grids: Arc::default(), bytes: 0, state: PrototypeState::Filling, next: 0 }
     }
 
     /// Forgets a prototype that is not complete; the first copy will fill it again.
     fn rewind(&mut self) {
         self.next = 0;
         if self.state == PrototypeState::Filling {
-            self.grids.clear();
+            self.grids = Arc::default();
             self.bytes = 0;
         }
     }
@@ -232,10 +316,10 @@ impl Prototype {
     fn keep(&mut self, grid: &Microgrid) {
         self.bytes += memory_bytes(grid);
         if self.bytes > PROTOTYPE_BYTES_MAX {
-            self.grids = Vec::new();
+            self.grids = Arc::default();
             self.state = PrototypeState::TooLarge;
         } else {
-            self.grids.push(grid.clone());
+            Arc::make_mut(&mut self.grids).push(grid.clone());
         }
     }
 }

@@ -3,7 +3,7 @@
 use glam::{DMat3, DMat4, DVec3, Vec3};
 
 use crate::stream::schema::names;
-use crate::stream::{Microgrid, Schema, ValueType, microgrid};
+use crate::stream::{Microgrid, Piece, Schema, ValueType, microgrid};
 use crate::{Error, Result};
 
 /// An affine map, prepared for many grids.
@@ -82,6 +82,51 @@ impl Placement {
             let n = n.try_normalize().unwrap_or(DVec3::ZERO).as_vec3();
             n.to_array().into_iter().for_each(|x| push(value_type, x, to));
         }
+    }
+}
+
+/// A column that is the copy's number in every grid.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct InstanceNumber {
+    pub column: usize,
+    pub number: u32,
+}
+
+impl InstanceNumber {
+    /// Writes the number into its column, adding the column if it is the last.
+    pub fn write(self, grid: &mut Microgrid) {
+        if grid.columns.len() == self.column {
+            grid.columns.push(Vec::new());
+        }
+        let column = &mut grid.columns[self.column];
+        column.clear();
+        column.extend_from_slice(&self.number.to_le_bytes());
+    }
+}
+
+/// A piece with every grid put elsewhere.
+pub(super) struct PlacedPiece {
+    pub inner: Box<dyn Piece>,
+    pub placement: Placement,
+    pub columns: PlacedColumns,
+    pub instance: Option<InstanceNumber>,
+}
+
+impl Piece for PlacedPiece {
+    fn read(
+        self: Box<Self>,
+        grid: &mut Microgrid,
+        each: &mut dyn FnMut(&Microgrid) -> Result<()>,
+    ) -> Result<()> {
+        let Self { inner, placement, columns, instance } = *self;
+        let mut decoded = Microgrid::default();
+        inner.read(&mut decoded, &mut |source| {
+            placement.apply(source, &columns, grid)?;
+            if let Some(instance) = instance {
+                instance.write(grid);
+            }
+            each(grid)
+        })
     }
 }
 

@@ -3,6 +3,8 @@
 use glam::{DMat4, DVec3, Vec3};
 
 use super::*;
+use crate::scene::{Procedural, ProceduralKind};
+use crate::stream::procedural::ProceduralStream;
 use crate::stream::schema::UpAxis;
 use crate::stream::{Attribute, Microgrid, MicrogridStream, Schema, ValueType};
 use crate::{ErrorKind, Result};
@@ -274,4 +276,55 @@ fn displaced_grids_get_near_anchors() {
     assert_eq!(far.position(2), DVec3::new(2.0, 2.0, 1025.0));
     assert_eq!(displaced(DVec3::splat(0.25)).unwrap().anchor, DVec3::ONE);
     assert!(displaced(DVec3::splat(f64::INFINITY)).is_err());
+}
+
+/// All grids of a stream, read in pieces, and how many pieces there were.
+fn all_pieces(stream: &mut dyn MicrogridStream) -> (Vec<Microgrid>, usize) {
+    let (mut grids, mut grid, mut pieces) = (Vec::new(), Microgrid::default(), 0);
+    stream.rewind().unwrap();
+    while let Some(piece) = stream.next_piece().unwrap() {
+        pieces += 1;
+        let mut push = |grid: &Microgrid| {
+            grids.push(grid.clone());
+            Ok(())
+        };
+        piece.read(&mut grid, &mut push).unwrap();
+    }
+    (grids, pieces)
+}
+
+/// Catches pieces of an adapter that differ from its grids: a part left out, a copy's number, a matrix.
+#[test]
+fn pieces_are_the_whole_stream() {
+    let jungle = |seed| {
+        let parameters = Procedural { kind: ProceduralKind::Jungle, seed, micropolygons: 30_000 };
+        ProceduralStream::new(&parameters, 0.01, UpAxis::Z).unwrap()
+    };
+    let matrices = |count: u32| {
+        let turned =
+            |i| DMat4::from_rotation_y(0.1 * f64::from(i)) * DMat4::from_scale(DVec3::new(1.0, -2.0, 3.0));
+        MatrixList::new((0..count).map(turned).collect())
+    };
+    let few = Instance::new(jungle(1), matrices(3)).unwrap();
+    let metres = Convert::to_units(jungle(2), 1.0, UpAxis::Y).unwrap();
+    let metres_again = Convert::to_units(few, 1.0, UpAxis::Y).unwrap();
+    let small = Grids::new(metres.schema().clone(), Vec::new());
+    let mut joined = Concat::new(vec![Box::new(metres), Box::new(small), Box::new(metres_again)]).unwrap();
+    let whole = all(&mut joined).unwrap();
+    let (grids, pieces) = all_pieces(&mut joined);
+    assert!(grids == whole && pieces > 4, "{pieces} pieces");
+    joined.rewind().unwrap();
+    assert!(all(&mut joined).unwrap() == whole, "pieces left something behind");
+
+    // A prototype too large to keep, and one of which many fit a piece
+    let parameters = Procedural { kind: ProceduralKind::Terrain, seed: 1, micropolygons: 700_000 };
+    let large = ProceduralStream::new(&parameters, 1.0, UpAxis::Y).unwrap();
+    let mut large = Instance::new(large, matrices(2)).unwrap();
+    assert!(all(&mut large).unwrap() == all_pieces(&mut large).0);
+    let parameters = Procedural { micropolygons: 100, ..parameters };
+    let tiny = ProceduralStream::new(&parameters, 1.0, UpAxis::Y).unwrap();
+    let mut many = Instance::new(tiny, matrices(1000)).unwrap();
+    let (grids, pieces) = all_pieces(&mut many);
+    many.rewind().unwrap();
+    assert!(grids == all(&mut many).unwrap() && pieces < 20, "{pieces} pieces");
 }

@@ -53,14 +53,35 @@ fn write(path: &Path, schema: &Schema, grids: &[Microgrid]) -> StreamCounts {
     writer.finish().unwrap()
 }
 
+/// Reads a file grid by grid, and sees that pieces give the same grids or the same error.
 fn read(path: &Path) -> crate::Result<Vec<Microgrid>> {
-    let mut reader = MgsReader::open(path)?;
-    let mut grids = Vec::new();
-    let mut grid = Microgrid::default();
-    while reader.next(&mut grid)? {
-        grids.push(grid.clone());
+    let grid_by_grid = || {
+        let mut reader = MgsReader::open(path)?;
+        let (mut grids, mut grid) = (Vec::new(), Microgrid::default());
+        while reader.next(&mut grid)? {
+            grids.push(grid.clone());
+        }
+        Ok(grids)
+    };
+    let in_pieces = || {
+        let mut reader = MgsReader::open(path)?;
+        let (mut grids, mut grid) = (Vec::new(), Microgrid::default());
+        while let Some(piece) = reader.next_piece()? {
+            let mut push = |grid: &Microgrid| {
+                grids.push(grid.clone());
+                Ok(())
+            };
+            piece.read(&mut grid, &mut push)?;
+        }
+        Ok(grids)
+    };
+    let (read, pieces): (crate::Result<Vec<Microgrid>>, crate::Result<_>) = (grid_by_grid(), in_pieces());
+    match (&read, &pieces) {
+        (Ok(read), Ok(pieces)) => assert!(read == pieces),
+        (Err(read), Err(pieces)) => assert_eq!(read.to_string(), pieces.to_string()),
+        _ => panic!("{read:?} but in pieces {pieces:?}"),
     }
-    Ok(grids)
+    read
 }
 
 /// Catches a lost or mixed-up column, counts that do not fit, a rewind that does not, and block boundaries.
@@ -128,6 +149,29 @@ fn every_flipped_bit_is_an_error() {
         assert!(offset <= bytes.len() as u64);
         bytes[bit / 8] ^= 1 << (bit % 8);
     }
+}
+
+/// Catches two contents with one identity, and one that reading changes.
+#[test]
+fn identities_tell_contents_apart() {
+    let folder = tempfile::tempdir().unwrap();
+    let schema = schema();
+    let path = folder.path().join("a.mgs");
+    let identity = |grids: &[Microgrid]| {
+        write(&path, &schema, grids);
+        let mut reader = MgsReader::open(&path).unwrap();
+        let identity = reader.identity().unwrap();
+        let mut grid = Microgrid::default();
+        assert!(reader.next(&mut grid).unwrap() && grid == grids[0], "a file is not at its start");
+        assert_eq!(reader.identity().unwrap(), identity);
+        identity
+    };
+    let many: Vec<Microgrid> = (0..2000).map(|seed| strip(&schema, seed, 50)).collect();
+    let mut moved = many.clone();
+    moved[1500].positions[3].x += 0.001;
+    let identities = [identity(&many), identity(&moved), identity(&many[..1999]), identity(&many)];
+    assert_eq!(identities[0], identities[3]);
+    assert!(identities[0] != identities[1] && identities[0] != identities[2]);
 }
 
 /// Catches a file that ends early and is taken for a shorter one, at a block's border too; and bytes after the end.

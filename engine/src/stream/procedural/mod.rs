@@ -23,19 +23,23 @@ mod wood;
 #[cfg(test)]
 mod tests;
 
+use std::ops::Range;
+use std::sync::Arc;
+
 use glam::{DMat4, DVec3, Vec3};
 
 use crate::math::hash::combine;
 use crate::scene::{Procedural, ProceduralKind};
+use crate::stream::piece::PIECE_VERTICES;
 use crate::stream::schema::{Schema, UpAxis};
-use crate::stream::{Microgrid, MicrogridStream};
+use crate::stream::{Microgrid, MicrogridStream, Piece};
 use crate::{Error, Result};
 
 use extent::{Extent, World};
 use noise::noise;
 use pen::{Paint, Pen, Space};
 use plant::{Part, Plan, Site};
-use terrain::Patch;
+use terrain::{Patch, PatchRange};
 
 /// Micropolygons that can be asked for at most.
 pub const MICROPOLYGONS_MAX: u64 = 1_000_000_000_000;
@@ -47,18 +51,19 @@ pub const MICROPOLYGONS_MAX: u64 = 1_000_000_000_000;
 #[derive(Clone, Debug)]
 pub struct ProceduralStream {
     schema: Schema,
-    space: Space,
-    world: World,
     extent: Extent,
-    cursor: Cursor,
-    pen: Pen,
-}
-
-/// How far the stream is, and the buffers of the patch and plant at hand.
-#[derive(Clone, Debug, Default)]
-struct Cursor {
     /// The next place on the Hilbert curve over all patches.
     place: u64,
+    artist: Artist,
+    /// Plants in the pieces so far.
+    plants: u32,
+}
+
+/// Draws one patch after the other: the ground, then plant by plant, part by part.
+#[derive(Clone, Debug)]
+struct Artist {
+    space: Space,
+    world: Arc<World>,
     patch: Patch,
     /// Plants of the patch, and the next one to plan.
     sites: Vec<Site>,
@@ -70,6 +75,39 @@ struct Cursor {
     foot: DVec3,
     /// Plants so far.
     plants: u32,
+    pen: Pen,
+}
+
+/// Patches of a procedural stream that have not been drawn yet.
+struct PatchPiece {
+    space: Space,
+    world: Arc<World>,
+    /// Each with its plants among `sites`.
+    patches: Vec<(PatchRange, Range<usize>)>,
+    sites: Vec<Site>,
+    /// Plants before the first patch.
+    plants: u32,
+}
+
+impl Piece for PatchPiece {
+    fn read(
+        self: Box<Self>,
+        grid: &mut Microgrid,
+        each: &mut dyn FnMut(&Microgrid) -> Result<()>,
+    ) -> Result<()> {
+        let mut artist = Artist::new(self.space, self.world);
+        artist.plants = self.plants;
+        for (range, sites) in self.patches {
+            artist.sites.clear();
+            artist.sites.extend_from_slice(&self.sites[sites]);
+            artist.draw_ground(range, grid);
+            each(grid)?;
+            while artist.draw_part(grid) {
+                each(grid)?;
+            }
+        }
+        Ok(())
+    }
 }
 
 impl ProceduralStream {
@@ -85,43 +123,65 @@ impl ProceduralStream {
         let schema = pen::schema(meters_per_unit, up);
         schema.validate()?;
         let (world, extent) = fit(parameters)?;
-        let space = Space::new(meters_per_unit, up);
-        Ok(Self { schema, space, world, extent, cursor: Cursor::default(), pen: Pen::default() })
+        let artist = Artist::new(Space::new(meters_per_unit, up), Arc::new(world));
+        Ok(Self { schema, extent, place: 0, artist, plants: 0 })
+    }
+}
+
+impl Artist {
+    fn new(space: Space, world: Arc<World>) -> Self {
+        Self {
+            space,
+            world,
+            patch: Patch::default(),
+            sites: Vec::new(),
+            site: 0,
+            plan: Plan::default(),
+            part: 0,
+            foot: DVec3::ZERO,
+            plants: 0,
+            pen: Pen::default(),
+        }
     }
 
-    /// Goes to the next patch and draws its ground. False at the end.
-    fn next_patch(&mut self, grid: &mut Microgrid) -> bool {
-        let cursor = &mut self.cursor;
-        let Some(range) = self.extent.next_patch(&mut cursor.place) else {
-            return false;
-        };
-        self.world.ground.patch(range, &mut cursor.patch);
-        let [low, high] = self.extent.rectangle(&range);
-        self.world.scatter.plants(low, high, &mut cursor.sites);
-        cursor.site = 0;
+    /// Goes to a patch whose plants are in `sites`, and draws its ground.
+    fn draw_ground(&mut self, range: PatchRange, grid: &mut Microgrid) {
+        self.world.ground.patch(range, &mut self.patch);
+        self.site = 0;
         self.pen.start();
-        let topology = cursor.patch.draw(&mut self.pen);
-        let paint = Paint { albedo: ground_albedo(&self.world, &cursor.patch), id: 0 };
-        self.pen.finish(grid, &self.space, cursor.patch.anchor(), topology, &paint);
+        let topology = self.patch.draw(&mut self.pen);
+        let paint = Paint { albedo: ground_albedo(&self.world, &self.patch), id: 0 };
+        self.pen.finish(grid, &self.space, self.patch.anchor(), topology, &paint);
+    }
+
+    /// Draws the next part of the patch's plants. False if there is none.
+    fn draw_part(&mut self, grid: &mut Microgrid) -> bool {
+        while self.part == self.plan.parts.len() {
+            if !self.plan_plant() {
+                return false;
+            }
+        }
+        let part = &self.plan.parts[self.part];
+        self.part += 1;
+        let topology = Part::draw(part, &mut self.pen);
+        let paint = Paint { albedo: part.albedo, id: self.plants };
+        self.pen.finish(grid, &self.space, self.foot, topology, &paint);
         true
     }
 
     /// Plans the next plant of the patch. False if there is none.
-    fn next_plant(&mut self) -> bool {
-        let cursor = &mut self.cursor;
-        let Some(site) = cursor.sites.get(cursor.site) else {
-            return false;
-        };
-        cursor.site += 1;
-        cursor.part = 0;
-        cursor.plants = cursor.plants.wrapping_add(1);
-        let height = cursor.patch.height(site.x, site.z);
+    fn plan_plant(&mut self) -> bool {
+        let Some(site) = self.sites.get(self.site) else { return false };
+        self.site += 1;
+        self.part = 0;
+        self.plants = self.plants.wrapping_add(1);
+        let height = self.patch.height(site.x, site.z);
         let slope = [
-            (cursor.patch.height(site.x + 0.05, site.z) - height) * 20.0,
-            (cursor.patch.height(site.x, site.z + 0.05) - height) * 20.0,
+            (self.patch.height(site.x + 0.05, site.z) - height) * 20.0,
+            (self.patch.height(site.x, site.z + 0.05) - height) * 20.0,
         ];
-        cursor.foot = Vec3::new(site.x, height, site.z).as_dvec3();
-        cursor.plan.grow(site, slope);
+        self.foot = Vec3::new(site.x, height, site.z).as_dvec3();
+        self.plan.grow(site, slope);
         true
     }
 }
@@ -132,30 +192,51 @@ impl MicrogridStream for ProceduralStream {
     }
 
     fn rewind(&mut self) -> Result<()> {
-        let Cursor { place, site, part, plants, .. } = &mut self.cursor;
-        (*place, *site, *part, *plants) = (0, 0, 0, 0);
-        self.cursor.sites.clear();
-        self.cursor.plan.parts.clear();
+        (self.place, self.plants) = (0, 0);
+        self.artist.plants = 0;
+        (self.artist.site, self.artist.part) = (0, 0);
+        self.artist.sites.clear();
+        self.artist.plan.parts.clear();
         Ok(())
     }
 
     fn next(&mut self, grid: &mut Microgrid) -> Result<bool> {
-        loop {
-            if let Some(part) = self.cursor.plan.parts.get(self.cursor.part) {
-                self.cursor.part += 1;
-                let topology = Part::draw(part, &mut self.pen);
-                let paint = Paint { albedo: part.albedo, id: self.cursor.plants };
-                self.pen.finish(grid, &self.space, self.cursor.foot, topology, &paint);
-                return Ok(true);
-            }
-            if !self.next_plant() {
-                return Ok(self.next_patch(grid));
-            }
+        if self.artist.draw_part(grid) {
+            return Ok(true);
         }
+        let Some(range) = self.extent.next_patch(&mut self.place) else { return Ok(false) };
+        let [low, high] = self.extent.rectangle(&range);
+        self.artist.world.scatter.plants(low, high, &mut self.artist.sites);
+        self.artist.draw_ground(range, grid);
+        Ok(true)
+    }
+
+    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        let Artist { space, world, .. } = &self.artist;
+        let mut piece = PatchPiece {
+            space: *space,
+            world: world.clone(),
+            patches: Vec::new(),
+            sites: Vec::new(),
+            plants: self.plants,
+        };
+        let (mut vertices, mut sites) = (0.0, Vec::new());
+        while vertices < PIECE_VERTICES as f64 {
+            let Some(range) = self.extent.next_patch(&mut self.place) else { break };
+            let [low, high] = self.extent.rectangle(&range);
+            world.scatter.plants(low, high, &mut sites);
+            let quads = sites.iter().map(|site| world.scatter.mean_quads[site.species as usize]);
+            vertices += 256.0 + quads.sum::<f64>();
+            let first = piece.sites.len();
+            piece.sites.append(&mut sites);
+            piece.patches.push((range, first..piece.sites.len()));
+        }
+        self.plants = self.plants.wrapping_add(piece.sites.len() as u32);
+        Ok((!piece.patches.is_empty()).then(|| Box::new(piece) as Box<dyn Piece>))
     }
 
     fn progress(&self) -> f64 {
-        self.extent.progress(self.cursor.place)
+        self.extent.progress(self.place)
     }
 }
 

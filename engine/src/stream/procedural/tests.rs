@@ -60,6 +60,29 @@ fn rewind_gives_the_same_bytes() {
     }
 }
 
+/// Catches pieces that leave something out, share something, or number plants anew.
+#[test]
+fn pieces_are_the_whole_stream() {
+    for kind in KINDS {
+        let mut stream = stream(kind, 3, 200_000);
+        let (mut whole, mut grid) = (Vec::new(), Microgrid::default());
+        while stream.next(&mut grid).unwrap() {
+            whole.push(grid.clone());
+        }
+        stream.rewind().unwrap();
+        let (mut pieces, mut grids) = (0, Vec::new());
+        while let Some(piece) = stream.next_piece().unwrap() {
+            pieces += 1;
+            let mut push = |grid: &Microgrid| {
+                grids.push(grid.clone());
+                Ok(())
+            };
+            piece.read(&mut grid, &mut push).unwrap();
+        }
+        assert!(pieces > 3 && grids == whole, "{kind:?}: {pieces} pieces");
+    }
+}
+
 /// Catches a seed that is ignored, wholly or in its upper half.
 #[test]
 fn seeds_differ() {
@@ -99,8 +122,8 @@ fn counts_are_near_those_asked_for() {
     for kind in KINDS {
         for (count, seeds) in [(10_000, 0..12), (100_000, 0..12), (1_000_000, 0..6), (10_000_000, 0..2)] {
             for seed in seeds {
-                let ProceduralStream { world, extent, .. } = stream(kind, seed, count);
-                let found = extent::exact(&world, &extent);
+                let ProceduralStream { artist, extent, .. } = stream(kind, seed, count);
+                let found = extent::exact(&artist.world, &extent);
                 let error = found as f64 / count as f64 - 1.0;
                 assert!(error.abs() < 0.1, "{kind:?} seed {seed}: {found} for {count}");
             }
@@ -112,8 +135,8 @@ fn counts_are_near_those_asked_for() {
 #[test]
 fn large_counts_are_estimated_well() {
     for kind in [ProceduralKind::Jungle, ProceduralKind::Grass] {
-        let ProceduralStream { world, extent, .. } = stream(kind, 5, 60_000_000);
-        let error = extent::exact(&world, &extent) as f64 / 60e6 - 1.0;
+        let ProceduralStream { artist, extent, .. } = stream(kind, 5, 60_000_000);
+        let error = extent::exact(&artist.world, &extent) as f64 / 60e6 - 1.0;
         assert!(error.abs() < 0.1, "{kind:?}: {error}");
     }
 }
@@ -128,10 +151,10 @@ fn counts_are_those_drawn_and_memory_is_constant() {
             quads += grid.face_count() as u64;
             vertices = vertices.max(grid.positions.capacity());
         }
-        assert_eq!(quads, extent::exact(&stream.world, &stream.extent));
+        assert_eq!(quads, extent::exact(&stream.artist.world, &stream.extent));
         assert!(vertices <= 512);
-        assert!(stream.cursor.sites.capacity() <= 1024);
-        assert!(stream.cursor.plan.parts.capacity() <= PARTS_MAX);
+        assert!(stream.artist.sites.capacity() <= 1024);
+        assert!(stream.artist.plan.parts.capacity() <= PARTS_MAX);
     }
 }
 
