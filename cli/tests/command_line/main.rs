@@ -237,7 +237,8 @@ fn failed_work_says_why_and_leaves_nothing() {
     fails(["inspect", &desk.at("none.mgs")], "none.mgs", None);
     fails(["inspect", &broken], "broken.obj", Some("pantaray import"));
     fails([Path::new("inspect"), desk.0.path()], "nothing to inspect", Some("bake's folder"));
-    fails(["export", &stream, "-o", &desk.at("out.usda")], "not supported yet", Some(".ply"));
+    fails(["export", &stream, "-o", &desk.at("out.abc")], "cannot export", Some(".usda"));
+    fails(["export", &stream, "--over", "-o", &desk.at("out.usda")], "which prims", Some("bake a USD file"));
     fails(["export", &desk.at("none.mgs"), "-o", &ply], "none.mgs", None);
     fails(["relight", &stream, "-o", &png], "sh_occlusion", Some("bake it first"));
     fails(["relight", &stream, "-o", &png, "--env", "sunst"], "sunst", Some("`sunset`"));

@@ -31,6 +31,7 @@ use std::path::Path;
 
 pub use self::assembly::Copies;
 pub use self::parts::{Part, Parts, SavedParts, import_parts};
+pub use self::usd::PRIMS_KEY;
 use crate::stream::{Microgrid, Schema, schema::UpAxis};
 use crate::{Error, Result};
 

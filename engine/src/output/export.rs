@@ -1,4 +1,7 @@
-//! Streams for other programs: binary PLY.
+//! Streams for other programs: binary PLY, USD, EXR of meshes with texture coordinates.
+
+mod exr;
+mod usd;
 
 use std::fmt::Write as _;
 use std::io::{BufWriter, Write};
@@ -28,6 +31,31 @@ pub struct ExportReport {
     pub bytes: u64,
     /// Whether positions are written as doubles, because floats would move them visibly.
     pub double_positions: bool,
+    /// Overs: vertices in prototypes, where an over cannot reach. Pictures: faces outside of 0 to 1.
+    pub left_out: u64,
+    /// Overs: points that no face uses, which are zero.
+    pub points_without: u64,
+}
+
+/// How to export.
+#[derive(Clone, Copy, Debug)]
+pub struct ExportOptions<'a> {
+    /// USD: overs on the prims that the stream came from, instead of points.
+    pub over: bool,
+    /// EXR: the attribute of texture coordinates.
+    pub uv: &'a str,
+    /// EXR: pixels across and down.
+    pub resolution: [u32; 2],
+    /// What USD and EXR may take.
+    pub memory_bytes: u64,
+    /// What the stream says about itself.
+    pub metadata: &'a [(String, String)],
+}
+
+impl Default for ExportOptions<'_> {
+    fn default() -> Self {
+        Self { over: false, uv: "st", resolution: [1024; 2], memory_bytes: 4 << 30, metadata: &[] }
+    }
 }
 
 /// Positions become doubles when a float at the far end of the bounds is off by more than this much of an edge.
@@ -39,18 +67,27 @@ const BUFFER_BYTES: usize = 1 << 20;
 /// Exports a stream in the format that the file's extension names.
 ///
 /// # Errors
-/// [`ErrorKind::Unsupported`] for any but `.ply`; otherwise like [`export_ply`].
-pub fn export(stream: &mut dyn MicrogridStream, path: &Path) -> Result<ExportReport> {
+/// [`ErrorKind::Unsupported`] for any but `.ply`, `.usd`, `.usda` and `.exr`, [`ErrorKind::Limit`] when USD or EXR
+/// take more memory than allowed; otherwise like [`export_ply`].
+pub fn export(
+    stream: &mut dyn MicrogridStream,
+    path: &Path,
+    options: &ExportOptions<'_>,
+) -> Result<ExportReport> {
     let extension =
         path.extension().and_then(|extension| extension.to_str()).unwrap_or("").to_ascii_lowercase();
     match extension.as_str() {
         "ply" => export_ply(stream, path),
-        "usda" | "usdc" => Err(Error::unsupported(format!("export to `.{extension}` is not supported yet"))
+        "usd" | "usda" if options.over => usd::export_over(stream, path, options),
+        "usd" | "usda" => usd::export_points(stream, path, options),
+        // What the library writes as binary, OpenUSD opens without its prims
+        "usdc" => Err(Error::unsupported("export to binary USD is not supported")
             .at(path)
-            .hint("export to .ply")),
+            .hint("export to .usda, and convert it: `usdcat in.usda -o out.usdc`")),
+        "exr" => exr::export_exr(stream, path, options),
         _ => Err(Error::unsupported(format!("cannot export to `.{extension}`"))
             .at(path)
-            .hint("export to .ply")),
+            .hint("export to .ply, .usda or .exr")),
     }
 }
 

@@ -234,7 +234,7 @@ fn ply_has_every_attribute_in_place() {
     stream.grids[1].push_face(&[0, 2, 1]);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
-    let report = export(&mut stream, &path).unwrap();
+    let report = export(&mut stream, &path, &Default::default()).unwrap();
     assert_eq!((report.vertices, report.faces, report.lines, report.points), (8, 3, 1, 1));
     assert_eq!(report.bytes, std::fs::metadata(&path).unwrap().len());
     assert!(!report.double_positions);
@@ -290,8 +290,8 @@ fn ply_positions_are_doubles_where_they_must_be() {
 fn a_refused_export_leaves_everything_as_it_was() {
     let folder = tempfile::tempdir().unwrap();
     let mut stream = squares(vec![], 1, |_, _, _, _| 0.0);
-    for name in ["a.usda", "a.usdc", "a.xyz", "a"] {
-        let error = export(&mut stream, &folder.path().join(name)).unwrap_err();
+    for name in ["a.usdc", "a.usdz", "a.xyz", "a"] {
+        let error = export(&mut stream, &folder.path().join(name), &Default::default()).unwrap_err();
         assert_eq!(error.kind(), ErrorKind::Unsupported);
     }
     /// A stream that breaks in its second pass.
@@ -310,7 +310,7 @@ fn a_refused_export_leaves_everything_as_it_was() {
     }
     let path = folder.path().join("a.ply");
     std::fs::write(&path, "old").unwrap();
-    assert!(export(&mut Breaks(stream, 0), &path).is_err());
+    assert!(export(&mut Breaks(stream, 0), &path, &Default::default()).is_err());
     assert_eq!(std::fs::read(&path).unwrap(), b"old");
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
 }

@@ -37,8 +37,8 @@ use crate::{Error, ErrorKind, Result};
 /// Prototypes that are files of their own at most; copies of further ones are written one by one.
 const PROTOTYPES_MAX: usize = 1024;
 
-/// Key of the metadata that lists the paths of the prims, one a line, in the order of `id`; a line for a prim that an
-/// over cannot reach begins with `-`.
+/// Key of the metadata that lists the prims, one a line, in the order of `id`: the number of its points, or `-` for a prim that
+/// an over cannot reach, and its path.
 pub const PRIMS_KEY: &str = "usd.prims";
 
 /// Keys of the metadata for the stage's own `metersPerUnit` and `upAxis`.
@@ -84,7 +84,10 @@ fn has(prims: &[Prim], primvar: &str) -> bool {
 
 /// The list of paths for the metadata, if there is room.
 fn list(prims: &[Prim], report: &mut ImportReport) -> Option<String> {
-    let line = |prim: &Prim| format!("{}{}", if prim.is_shared { "-" } else { "" }, prim.path);
+    let line = |prim: &Prim| match prim.is_shared {
+        true => format!("- {}", prim.path),
+        false => format!("{} {}", prim.points, prim.path),
+    };
     let list = prims.iter().map(line).collect::<Vec<_>>().join("\n");
     if list.len() > PRIMS_BYTES_MAX {
         report.warn(

@@ -148,7 +148,10 @@ fn only_what_is_to_be_seen_is_read() {
         ("prims of type `Sphere`", 1),
     ];
     assert_eq!(skipped, expected);
-    assert_eq!(sink.metadata.iter().find(|(key, _)| key == super::PRIMS_KEY).unwrap().1, "/plain\n/render");
+    assert_eq!(
+        sink.metadata.iter().find(|(key, _)| key == super::PRIMS_KEY).unwrap().1,
+        "4 /plain\n4 /render"
+    );
 }
 
 /// Catches units or axes that are not converted, transforms in the wrong order, and a reset that does not reset.

@@ -49,6 +49,8 @@ pub(super) struct Prim {
     pub scope_from_prim: DMat4,
     /// Its primvars, its own and inherited ones.
     pub primvars: Vec<Primvar>,
+    /// How many points it has.
+    pub points: usize,
     /// Whether it writes normals of its own.
     pub has_normals: bool,
     /// Whether it stands in a prototype, where an over would reach all copies or none.
@@ -261,10 +263,21 @@ impl Walk<'_> {
                 let primvars = primvar::of_prim(self.stage, path, &node.inherited);
                 let has_normals = primvars.iter().any(|primvar| primvar.name == "normals")
                     || self.stage.value(path, "normals").is_some();
+                let points = self.stage.value(path, "points").and_then(|value| super::value::vectors(&value));
+                let points = points.map_or(0, |points| points.len());
                 let path = path.to_owned();
                 // Scope and sharing are known once the scope is complete
                 let (scope, is_shared) = (0, false);
-                prims.push(Prim { path, kind, scope, scope_from_prim, primvars, has_normals, is_shared });
+                prims.push(Prim {
+                    path,
+                    kind,
+                    scope,
+                    scope_from_prim,
+                    primvars,
+                    points,
+                    has_normals,
+                    is_shared,
+                });
             }
             (None, "PointInstancer") => {
                 instancer::place(self, path, scope_from_prim, nesting, uses)?;
