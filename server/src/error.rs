@@ -84,7 +84,7 @@ impl Error {
     pub fn problem(&self) -> Problem {
         let (status, code, title) = self.parts();
         Problem {
-            kind: format!("https://pantaray.dev/problems/{code}"),
+            kind: format!("/problems/{code}"),
             title: title.into(),
             status: status.as_u16(),
             code: code.into(),

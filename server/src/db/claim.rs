@@ -54,7 +54,10 @@ impl Store {
             self.dialect().lock_s_skip
         );
         let rows = tx.query(sql.into(), values![pass, segment, PassState::Open.code()]).await?;
-        let Some(row) = rows.first() else { return Ok(None) };
+        let Some(row) = rows.first() else {
+            tx.rollback().await?;
+            return Ok(None);
+        };
         let (job, first_of_job) = (row.text(0)?, row.int_or_null(1)?.is_none());
 
         // Take what this worker has not failed at, if there are others who can
@@ -79,6 +82,8 @@ impl Store {
         let batch = |row: &super::Row| Ok(ClaimedBatch { batch: row.int(0)?, fence: row.int(1)? });
         let mut batches = rows.iter().map(batch).collect::<Result<Vec<_>>>()?;
         if batches.is_empty() {
+            // Others skip a locked segment: it must be free before this claim says that it found nothing
+            tx.rollback().await?;
             return Ok(None);
         }
         batches.sort_unstable_by_key(|batch| batch.batch);

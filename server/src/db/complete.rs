@@ -72,7 +72,7 @@ impl Store {
     pub async fn complete(&self, reporter: &Reporter<'_>, items: &[CompleteItem]) -> Result<Completion> {
         let mut tx = self.begin().await?;
         let Some(context) = self.lock_lease(&mut tx, reporter.lease, Some(reporter.session)).await? else {
-            drop(tx);
+            tx.rollback().await?;
             return self.late(reporter, items).await;
         };
         let mut completion = Completion {

@@ -160,7 +160,7 @@ pub trait Driver: Send + Sync {
     async fn close(&self);
 }
 
-/// A transaction; dropped without a commit, it changes nothing.
+/// A transaction; dropped without a commit, it changes nothing, but its locks stay for a moment after.
 #[async_trait]
 pub trait Transaction: Send {
     /// Runs a statement and says how many rows it changed.
@@ -171,4 +171,7 @@ pub trait Transaction: Send {
 
     /// Commits. When this returns, the changes outlive the process; with PostgreSQL, the machine as well.
     async fn commit(self: Box<Self>) -> Result<()>;
+
+    /// Changes nothing; when this returns, the locks are gone.
+    async fn rollback(self: Box<Self>) -> Result<()>;
 }

@@ -107,4 +107,8 @@ impl Transaction for PostgresTransaction {
     async fn commit(self: Box<Self>) -> Result<()> {
         Ok(self.0.commit().await?)
     }
+
+    async fn rollback(self: Box<Self>) -> Result<()> {
+        Ok(self.0.rollback().await?)
+    }
 }

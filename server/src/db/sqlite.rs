@@ -140,4 +140,8 @@ impl Transaction for SqliteTransaction {
     async fn commit(self: Box<Self>) -> Result<()> {
         Ok(self.0.commit().await?)
     }
+
+    async fn rollback(self: Box<Self>) -> Result<()> {
+        Ok(self.0.rollback().await?)
+    }
 }
