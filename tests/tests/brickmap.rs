@@ -43,7 +43,7 @@ fn build_at(target: &Path, threads: usize, memory_bytes: u64, cancel: bool) -> e
         memory_bytes,
         threads,
         scratch: scratch.path().to_path_buf(),
-        far_field: FarField::Paper,
+        far_field: FarField::Directional,
     };
     let [mut fine, mut coarse] = scene();
     let streams: [&mut dyn MicrogridStream; 2] = [&mut fine, &mut coarse];

@@ -178,6 +178,22 @@ fn octaves(t: f32) -> f32 {
     -(exponent + (f + (f * (1.0 - f)) * q))
 }
 
+/// The share of light that a stored extinction lets through, within 2e-5; exact at whole octaves and for [`OPAQUE`].
+#[inline(always)]
+pub fn transmittance(extinction: u16) -> f32 {
+    if extinction == OPAQUE {
+        return 0.0;
+    }
+    // 2^-(whole + f), with the Taylor series of 2^-f
+    let power = f32::from(extinction) * (1.0 / EXTINCTION_PER_OCTAVE);
+    let whole = power.floor();
+    let x = (power - whole) * -std::f32::consts::LN_2;
+    let series =
+        (((((x * (1.0 / 720.0) + 1.0 / 120.0) * x + 1.0 / 24.0) * x + 1.0 / 6.0) * x + 0.5) * x + 1.0) * x
+            + 1.0;
+    series * f32::from_bits((127 - whole as u32) << 23)
+}
+
 /// A decoded record of kind [`Plate`](Kind::Plate).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plate {
@@ -341,6 +357,19 @@ mod tests {
             assert!(error < 5.5e-5, "{t}: {error}");
         }
         assert_eq!([1.0, 0.5, 0.125].map(octaves), [0.0, 1.0, 3.0]);
+    }
+
+    /// Catches transmittances that are not those of the opacities that extinctions are made from.
+    #[test]
+    fn transmittance_inverts_extinction() {
+        for i in 0..=1000 {
+            let opacity = i as f32 / 1000.0;
+            let extinction = crate::brick::leaf::extinction_from_opacity(opacity);
+            let error = (transmittance(extinction) - (1.0 - opacity)).abs();
+            // Half a unit of extinction is 8.5e-5 of the transmittance
+            assert!(error < 9e-5, "{opacity}: {error}");
+        }
+        assert_eq!([0, 4096, 8192, OPAQUE].map(transmittance), [1.0, 0.5, 0.25, 0.0]);
     }
 
     /// Catches a plate that does not contain what it was made for, or is much thicker, or whose normal is another.

@@ -114,6 +114,11 @@ impl LatticeBox {
         self.max = self.max.max(point);
     }
 
+    /// Whether they have a point in common.
+    pub fn touches(&self, other: &Self) -> bool {
+        self.min.cmple(other.max).all() && self.max.cmpge(other.min).all()
+    }
+
     /// Whether it holds nothing.
     pub fn is_empty(&self) -> bool {
         !self.min.cmple(self.max).all()

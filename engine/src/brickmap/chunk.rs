@@ -67,7 +67,7 @@ impl Chunk {
         self.faces = faces;
     }
 
-    /// Makes leaves of the pooled faces. Call it once, at the end.
+    /// Makes leaves of the pooled faces, and room for those who read past the last leaf. Call it once, at the end.
     pub fn finish(&mut self) {
         for mut pool in std::mem::take(&mut self.pools) {
             pool.sort_by_key(|&(shift, _)| shift);
@@ -76,6 +76,7 @@ impl Chunk {
                 self.split(&faces, run[0].0);
             }
         }
+        self.leaves.extend_from_slice(&[0; leaf::READ_PAST_BYTES]);
     }
 
     /// A face of a grid whose indices start at `at`; none if it is degenerate, counted.

@@ -11,7 +11,7 @@ use crate::stream::schema::Schema;
 use crate::stream::{Microgrid, Piece};
 use crate::{Error, Result};
 
-/// Pass 2. The grids of the first `done` partitions are left out.
+/// Pass 2. Of the grids of the first `done` partitions only the boxes are kept.
 ///
 /// # Errors
 /// When a stream is broken or differs from what pass 1 read, the disk is full, or the build is cancelled.
@@ -37,9 +37,11 @@ pub fn fill(
                     return Ok(());
                 }
                 let partition = census.cells.partition_of(middle(grid)).ok_or_else(changed)?;
+                quantise(grid, &schema, &columns, lattice, shift, quantised);
                 if partition >= done {
-                    quantise(grid, &schema, &columns, lattice, shift, quantised);
                     batch.push(partition, quantised);
+                } else {
+                    batch.note(partition, quantised);
                 }
                 Ok(())
             })?;

@@ -12,6 +12,7 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
 use super::spill::Quantised;
+use crate::brick::LatticeBox;
 use crate::{Error, Result};
 
 /// Buffers grow by this much.
@@ -27,6 +28,8 @@ pub struct Batch {
     bytes: Vec<u8>,
     /// Partition, bytes and micropolygons of each grid.
     grids: Vec<(u32, u32, u32)>,
+    /// Boxes of the grids, by partition.
+    bounds: Vec<(u32, LatticeBox)>,
 }
 
 impl Batch {
@@ -36,6 +39,16 @@ impl Batch {
         grid.encode(&mut self.bytes);
         let bytes = (self.bytes.len() - start) as u32;
         self.grids.push((partition as u32, bytes, grid.arities.len() as u32));
+        self.note(partition, grid);
+    }
+
+    /// Adds a grid's box alone: the grid is not needed any more.
+    pub fn note(&mut self, partition: usize, grid: &Quantised) {
+        let bounds = grid.bounds();
+        match self.bounds.last_mut() {
+            Some((last, all)) if *last == partition as u32 => *all = all.union(bounds),
+            _ => self.bounds.push((partition as u32, bounds)),
+        }
     }
 }
 
@@ -56,6 +69,8 @@ pub struct Spilled {
     skipped: u64,
     /// Micropolygons of the range, to the end of the grid in which it ends.
     pub micropolygons: u64,
+    /// The box of all its vertices, without radii; for a range that of all it is a range of.
+    pub bounds: LatticeBox,
 }
 
 /// The file behind a log.
@@ -77,12 +92,13 @@ pub struct Spill {
 }
 
 /// What a partition has in memory and on disk.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Buffer {
     chunks: Vec<Vec<u8>>,
     bytes: usize,
     micropolygons: u32,
     blocks: Vec<Block>,
+    bounds: LatticeBox,
 }
 
 /// A block for the writing thread.
@@ -112,7 +128,7 @@ impl Spill {
         let in_flight = BLOCKS_IN_FLIGHT * BLOCK_BYTES;
         Ok(Self {
             log,
-            partitions: (0..partitions).map(|_| Buffer::default()).collect(),
+            partitions: (0..partitions).map(|_| Buffer::new()).collect(),
             buffered_bytes: 0,
             buffered_bytes_max: (memory_bytes as usize).saturating_sub(in_flight).max(BLOCK_BYTES),
             written: 0,
@@ -125,6 +141,10 @@ impl Spill {
     /// # Errors
     /// When the disk is full or fails.
     pub fn add(&mut self, batch: &Batch) -> Result<()> {
+        for &(partition, bounds) in &batch.bounds {
+            let all = &mut self.partitions[partition as usize].bounds;
+            *all = all.union(bounds);
+        }
         let mut rest = &batch.bytes[..];
         for &(partition, bytes, micropolygons) in &batch.grids {
             let (record, after) = rest.split_at(bytes as usize);
@@ -152,7 +172,13 @@ impl Spill {
         self.join()?;
         let spilled = |buffer: Buffer| {
             let micropolygons = buffer.blocks.iter().map(|block| u64::from(block.micropolygons)).sum();
-            Spilled { log: self.log.clone(), blocks: buffer.blocks, skipped: 0, micropolygons }
+            Spilled {
+                log: self.log.clone(),
+                blocks: buffer.blocks,
+                skipped: 0,
+                micropolygons,
+                bounds: buffer.bounds,
+            }
         };
         Ok((std::mem::take(&mut self.partitions).into_iter().map(spilled).collect(), self.written))
     }
@@ -189,6 +215,10 @@ impl Drop for Spill {
 }
 
 impl Buffer {
+    fn new() -> Self {
+        Self { chunks: Vec::new(), bytes: 0, micropolygons: 0, blocks: Vec::new(), bounds: LatticeBox::EMPTY }
+    }
+
     /// Appends a record. Returns the bytes by which the buffer grew.
     fn push(&mut self, mut record: &[u8], micropolygons: u32) -> usize {
         let before = self.chunks.len();
@@ -230,6 +260,7 @@ impl Spilled {
             blocks: vec![block],
             skipped: 0,
             micropolygons: u64::from(block.micropolygons),
+            bounds: self.bounds,
         })
     }
 
@@ -250,7 +281,7 @@ impl Spilled {
                 }
                 before = after;
             }
-            Self { log: self.log.clone(), blocks, skipped, micropolygons: to - from }
+            Self { log: self.log.clone(), blocks, skipped, micropolygons: to - from, bounds: self.bounds }
         };
         (0..self.micropolygons.div_ceil(micropolygons)).map(range).collect()
     }

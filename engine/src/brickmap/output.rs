@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use super::bvh;
 use super::chunk::Skipped;
-use super::pack::{self, ByteSplit, Packed, Primitive};
+use super::farfield;
+use super::pack::{self, ByteSplit, Far, Packed, Primitive};
 use super::writer::MapWriter;
 use crate::brick::{LatticeBox, renumber};
 use crate::{Error, Result};
@@ -34,6 +35,7 @@ struct Note {
     is_last: bool,
     /// With its number in the map.
     root: Option<Primitive>,
+    far_root: Option<farfield::Root>,
     split: ByteSplit,
     skipped: Skipped,
     leaves: u64,
@@ -46,6 +48,8 @@ pub struct Output {
     pub writer: MapWriter,
     /// Root bricks of the partitions.
     pub roots: Vec<Primitive>,
+    /// What a directional far field needs of them.
+    far_roots: Vec<farfield::Root>,
     /// Where the bytes go.
     pub split: ByteSplit,
     /// What was left out.
@@ -68,6 +72,7 @@ impl Output {
         let mut output = Self {
             writer,
             roots: Vec::new(),
+            far_roots: Vec::new(),
             split: ByteSplit::default(),
             skipped: Skipped::default(),
             leaves: 0,
@@ -95,6 +100,7 @@ impl Output {
             partition: built.partition,
             is_last: built.is_last,
             root: built.root,
+            far_root: built.packed.root,
             split: built.packed.split,
             skipped: built.skipped,
             leaves: built.leaves,
@@ -112,6 +118,7 @@ impl Output {
         self.skipped.no_radius += note.skipped.no_radius;
         self.skipped.transparent += note.skipped.transparent;
         self.roots.extend(note.root);
+        self.far_roots.extend(note.far_root);
         if note.is_last {
             self.partitions = note.partition + 1;
         }
@@ -130,7 +137,10 @@ impl Output {
             roots => {
                 let boxes: Vec<LatticeBox> = roots.iter().map(|root| root.bounds).collect();
                 let mut packed = Packed::default();
-                let root = pack::pack(&bvh::build(&boxes), roots, &[], self.writer.bricks(), &mut packed);
+                // A directional far field says something of every root, the paper's of none
+                let far = if self.far_roots.is_empty() { Far::Paper } else { Far::Over(&self.far_roots) };
+                let root =
+                    pack::pack(&bvh::build(&boxes), roots, &[], self.writer.bricks(), far, &mut packed);
                 self.writer.write(&packed.bytes, &packed.lengths, None)?;
                 self.split += packed.split;
                 Ok(root)

@@ -4,10 +4,12 @@
 //! bricks of their own. Bricks are numbered and written children first, in the order of the tree: a subtree is one run of
 //! bytes, and the last brick is its root.
 
-use super::bvh::{WideChild, WideTree};
-use super::farfield;
+use super::bvh::{WideChild, WideNode, WideTree};
+use super::farfield::{self, shapes::Shapes};
+use crate::brick::lanes::InstructionSet;
+use crate::brick::leaf::{self, Layout};
 use crate::brick::node::{LOCATION_BYTES, WIDTH};
-use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble, leaf};
+use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble, far};
 
 /// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
 /// larger ones load what a batch does not touch.
@@ -51,6 +53,8 @@ pub struct Packed {
     pub lengths: Vec<u32>,
     /// Bytes by what they are for.
     pub split: ByteSplit,
+    /// What a tree over partitions needs of the root, with a directional far field.
+    pub root: Option<farfield::Root>,
 }
 
 /// Where a brick map's bytes go.
@@ -92,18 +96,28 @@ struct Subtree {
     is_brick: bool,
 }
 
-/// Packs `tree` over `primitives` into bricks numbered from `first_number` on. `leaves` holds the encoded leaves. Returns the
-/// root brick as a primitive of a higher tree.
+/// Packs `tree` over `primitives` into bricks numbered from `first_number` on. `leaves` holds the encoded leaves and runs on
+/// past its end by [`READ_PAST_BYTES`](crate::brick::leaf::READ_PAST_BYTES). Returns the root brick as a primitive of a
+/// higher tree.
 pub fn pack(
     tree: &WideTree,
     primitives: &[Primitive],
     leaves: &[u8],
     first_number: u32,
+    far: Far<'_>,
     out: &mut Packed,
 ) -> Primitive {
     let mut subtrees = measure(tree, primitives);
     subtrees[0].is_brick = true;
-    let mut packer = Packer { tree, primitives, leaves, subtrees: &subtrees, first_number, out };
+    let mut nodes = nodes(tree, primitives, &subtrees);
+    match far {
+        Far::Paper => fill_paper(tree, primitives, &subtrees, &mut nodes),
+        Far::Directional(others) => {
+            out.root = Some(fill_directional(tree, primitives, leaves, others, &mut nodes));
+        }
+        Far::Over(roots) => fill_top(tree, roots, &mut nodes),
+    }
+    let mut packer = Packer { tree, primitives, leaves, subtrees: &subtrees, nodes, first_number, out };
     let number = packer.brick(0);
     let root = &subtrees[0];
     Primitive {
@@ -112,6 +126,89 @@ pub fn pack(
         opaque_area: root.opaque_area as f32,
         micropolygons: root.micropolygons,
         content: Content::Brick(number),
+    }
+}
+
+/// How nodes get their far field.
+#[derive(Clone, Copy, Debug)]
+pub enum Far<'a> {
+    /// By the paper's formula.
+    Paper,
+    /// By lines through the leaves, among others' geometry.
+    Directional(farfield::Others<'a>),
+    /// From what was found of the roots of partitions, which the tree is over.
+    Over(&'a [farfield::Root]),
+}
+
+/// The tree's nodes with boxes, without far field; their children are not placed yet.
+fn nodes(tree: &WideTree, primitives: &[Primitive], subtrees: &[Subtree]) -> Vec<Node> {
+    let bounds = |child: &WideChild| match *child {
+        WideChild::Node(node) => subtrees[node as usize].bounds,
+        WideChild::Primitive(primitive) => primitives[primitive as usize].bounds,
+    };
+    let over = |wide: &WideNode| {
+        let mut boxes = [LatticeBox::EMPTY; WIDTH];
+        let children = &wide.children[..usize::from(wide.count)];
+        children.iter().zip(&mut boxes).for_each(|(child, b)| *b = bounds(child));
+        Node::over(&boxes[..children.len()])
+    };
+    tree.nodes.iter().map(over).collect()
+}
+
+/// Fills the nodes with the paper's far field.
+fn fill_paper(tree: &WideTree, primitives: &[Primitive], subtrees: &[Subtree], nodes: &mut [Node]) {
+    for (node, wide) in nodes.iter_mut().zip(&tree.nodes) {
+        for (slot, child) in wide.children[..usize::from(wide.count)].iter().enumerate() {
+            let (area, opaque_area) = areas(child, primitives, subtrees);
+            node.far[slot] = farfield::paper(&node.child_box(slot), area, opaque_area);
+        }
+    }
+}
+
+/// Fills the nodes over leaves with the directional far field and returns what it is of the root.
+fn fill_directional(
+    tree: &WideTree,
+    primitives: &[Primitive],
+    leaves: &[u8],
+    others: farfield::Others<'_>,
+    nodes: &mut [Node],
+) -> farfield::Root {
+    let mut shapes = Shapes::default();
+    for primitive in primitives {
+        if let Content::Leaf { offset, .. } = primitive.content {
+            let leaf = &leaves[offset as usize..];
+            shapes.push(leaf, &Layout::read_trusted(leaf, primitive.bounds.min));
+        }
+    }
+    let (records, root) = farfield::directional(tree, nodes, &shapes, others, InstructionSet::detect());
+    nodes.iter_mut().zip(records).for_each(|(node, far)| node.far = far);
+    root
+}
+
+/// Fills the nodes over partitions. Those that hold several are always opened: a batch that is far enough away from them is
+/// rare, and they are few.
+fn fill_top(tree: &WideTree, roots: &[farfield::Root], nodes: &mut [Node]) {
+    for (node, wide) in nodes.iter_mut().zip(&tree.nodes) {
+        for (slot, child) in wide.children[..usize::from(wide.count)].iter().enumerate() {
+            node.far[slot] = match *child {
+                WideChild::Primitive(root) => roots[root as usize].record(&node.child_box(slot)),
+                WideChild::Node(_) => far::marked([0; 6]),
+            };
+        }
+    }
+}
+
+/// Sums of areas below a child: of all, and weighted by opacity.
+fn areas(child: &WideChild, primitives: &[Primitive], subtrees: &[Subtree]) -> (f32, f32) {
+    match *child {
+        WideChild::Node(node) => {
+            let subtree = &subtrees[node as usize];
+            (subtree.area as f32, subtree.opaque_area as f32)
+        }
+        WideChild::Primitive(primitive) => {
+            let primitive = &primitives[primitive as usize];
+            (primitive.area, primitive.opaque_area)
+        }
     }
 }
 
@@ -179,6 +276,7 @@ struct Packer<'a> {
     primitives: &'a [Primitive],
     leaves: &'a [u8],
     subtrees: &'a [Subtree],
+    nodes: Vec<Node>,
     first_number: u32,
     out: &'a mut Packed,
 }
@@ -206,12 +304,8 @@ impl Packer<'_> {
         for &member in &members {
             let wide = self.tree.nodes[member as usize];
             let children = &wide.children[..usize::from(wide.count)];
-            let mut boxes = [LatticeBox::EMPTY; WIDTH];
-            children.iter().zip(&mut boxes).for_each(|(child, b)| *b = self.bounds(child));
-            let mut node = Node::over(&boxes[..children.len()]);
+            let mut node = self.nodes[member as usize];
             for (slot, child) in children.iter().enumerate() {
-                let (area, opaque_area) = self.areas(child);
-                node.far[slot] = farfield::paper(&node.child_box(slot), area, opaque_area);
                 let reference = match *child {
                     WideChild::Node(child) if self.subtrees[child as usize].is_brick => {
                         table.push(self.brick(child));
@@ -259,25 +353,5 @@ impl Packer<'_> {
             directory: 0,
         };
         number
-    }
-
-    fn bounds(&self, child: &WideChild) -> LatticeBox {
-        match *child {
-            WideChild::Node(node) => self.subtrees[node as usize].bounds,
-            WideChild::Primitive(primitive) => self.primitives[primitive as usize].bounds,
-        }
-    }
-
-    fn areas(&self, child: &WideChild) -> (f32, f32) {
-        match *child {
-            WideChild::Node(node) => {
-                let subtree = &self.subtrees[node as usize];
-                (subtree.area as f32, subtree.opaque_area as f32)
-            }
-            WideChild::Primitive(primitive) => {
-                let primitive = &self.primitives[primitive as usize];
-                (primitive.area, primitive.opaque_area)
-            }
-        }
     }
 }

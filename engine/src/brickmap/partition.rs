@@ -6,9 +6,9 @@ use super::budget::{Budget, Permit};
 use super::chunk::{Chunk, Skipped};
 use super::log::{Batch, Spill, Spilled};
 use super::output::{Built, Output};
-use super::pack::{self, Packed};
+use super::pack::{self, Far, Packed};
 use super::spill::Quantised;
-use super::{Job, PARTITION_MICROPOLYGONS, bvh};
+use super::{FarField, Job, PARTITION_MICROPOLYGONS, bvh};
 use crate::Result;
 use crate::brick::LatticeBox;
 use crate::stream::piece::in_order;
@@ -20,7 +20,7 @@ const CUTS_MAX: u32 = 6;
 const TABLES_MAX: usize = 4;
 
 /// Bytes that building a partition takes for every micropolygon at most, its bricks included.
-const BYTES_PER_MICROPOLYGON: u64 = 130;
+const BYTES_PER_MICROPOLYGON: u64 = 190;
 
 /// Builds what was spilled and writes it. `done` partitions are written already.
 ///
@@ -28,6 +28,7 @@ const BYTES_PER_MICROPOLYGON: u64 = 130;
 /// When the disk is full or fails, or the build is cancelled.
 pub fn build_all(spilled: Vec<Spilled>, done: usize, output: &mut Output, job: &Job<'_>) -> Result<u64> {
     let count = spilled.len();
+    let bounds: Vec<LatticeBox> = spilled.iter().map(|spilled| spilled.bounds).collect();
     let (mut parts, mut spilled_bytes) = (Vec::new(), 0);
     for (partition, spilled) in spilled.into_iter().enumerate().skip(done) {
         let first = parts.len();
@@ -35,6 +36,7 @@ pub fn build_all(spilled: Vec<Spilled>, done: usize, output: &mut Output, job: &
         if let Some(last) = parts[first..].last_mut() {
             last.is_last = true;
         }
+        find_others(&mut parts[first..], &bounds);
     }
     let budget = Budget::new(job.options.memory_bytes / 4 * 3);
     let mut parts = parts.into_iter();
@@ -64,6 +66,19 @@ struct Part {
     /// Whether it ends with this part.
     is_last: bool,
     grids: Spilled,
+    /// Boxes of other partitions, and of other parts of the same one, that touch its own.
+    others: Vec<LatticeBox>,
+}
+
+/// Sets the others of all parts of a partition; `bounds` are the boxes of the partitions.
+fn find_others(parts: &mut [Part], bounds: &[LatticeBox]) {
+    let siblings: Vec<LatticeBox> = parts.iter().map(|part| part.grids.bounds).collect();
+    for (number, part) in parts.iter_mut().enumerate() {
+        let own = part.grids.bounds;
+        let others = bounds.iter().enumerate().filter(|&(partition, _)| partition != part.partition);
+        let siblings = siblings.iter().enumerate().filter(|&(sibling, _)| sibling != number);
+        part.others = others.chain(siblings).map(|(_, other)| *other).filter(|b| b.touches(&own)).collect();
+    }
 }
 
 /// Adds a partition to `parts`, cut again on finer cells as long as it is more than twice as large as it should be.
@@ -76,7 +91,7 @@ fn cut_again(
     job: &Job<'_>,
 ) -> Result<()> {
     if grids.micropolygons <= 2 * PARTITION_MICROPOLYGONS {
-        parts.push(Part { partition, is_last: false, grids });
+        parts.push(Part { partition, is_last: false, grids, others: Vec::new() });
         return Ok(());
     }
 
@@ -85,7 +100,7 @@ fn cut_again(
     if pieces == 1 || depth == CUTS_MAX {
         // It lies on one spot, or is nested too deep: by number
         let ranges = grids.ranges(PARTITION_MICROPOLYGONS).into_iter();
-        parts.extend(ranges.map(|grids| Part { partition, is_last: false, grids }));
+        parts.extend(ranges.map(|grids| Part { partition, is_last: false, grids, others: Vec::new() }));
         return Ok(());
     }
     let (pieces, bytes) = spill_again(&grids, &cells, pieces, job)?;
@@ -156,7 +171,11 @@ fn build(part: &Part, job: &Job<'_>) -> Result<Built> {
         let boxes: Vec<LatticeBox> = clusters.iter().map(|cluster| cluster.bounds).collect();
         let tree = bvh::build(&boxes);
         drop(boxes);
-        pack::pack(&tree, &clusters, &leaves, 0, &mut packed)
+        let far = match job.options.far_field {
+            FarField::Paper => Far::Paper,
+            FarField::Directional => Far::Directional(&part.others),
+        };
+        pack::pack(&tree, &clusters, &leaves, 0, far, &mut packed)
     });
     job.check()?;
     let skipped: Skipped = skipped;

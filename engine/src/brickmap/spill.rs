@@ -15,6 +15,8 @@
 
 use glam::IVec3;
 
+use crate::brick::LatticeBox;
+
 const SHORT: u8 = 1;
 const REGULAR: u8 = 2;
 const EXTINCTIONS: u8 = 4;
@@ -48,6 +50,14 @@ impl Quantised {
         self.extinctions.clear();
         self.radii.clear();
         (self.shift, self.columns) = (0, 0);
+    }
+
+    /// The box of its vertices.
+    pub fn bounds(&self) -> LatticeBox {
+        self.vertices.iter().fold(LatticeBox::EMPTY, |mut all, &vertex| {
+            all.add(vertex);
+            all
+        })
     }
 
     /// Sees whether the faces are a regular grid of quads in rows, and notes how many are in a row.
