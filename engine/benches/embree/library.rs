@@ -79,7 +79,7 @@ pub struct Scene {
     scene: Handle,
 }
 
-// A committed scene is only read
+// SAFETY: a committed scene is only read
 unsafe impl Sync for Scene {}
 
 impl Scene {
@@ -188,17 +188,17 @@ impl Functions {
         // SAFETY: these are Embree 4's signatures
         unsafe {
             Some(Self {
-                new_device: std::mem::transmute::<Handle, _>(symbol("rtcNewDevice")?),
-                new_scene: std::mem::transmute::<Handle, _>(symbol("rtcNewScene")?),
-                new_geometry: std::mem::transmute::<Handle, _>(symbol("rtcNewGeometry")?),
-                new_buffer: std::mem::transmute::<Handle, _>(symbol("rtcSetNewGeometryBuffer")?),
-                commit_geometry: std::mem::transmute::<Handle, _>(symbol("rtcCommitGeometry")?),
-                attach_geometry: std::mem::transmute::<Handle, _>(symbol("rtcAttachGeometry")?),
-                commit_scene: std::mem::transmute::<Handle, _>(symbol("rtcCommitScene")?),
-                occluded1: std::mem::transmute::<Handle, _>(symbol("rtcOccluded1")?),
-                occluded16: std::mem::transmute::<Handle, _>(symbol("rtcOccluded16")?),
-                intersect1: std::mem::transmute::<Handle, _>(symbol("rtcIntersect1")?),
-                intersect16: std::mem::transmute::<Handle, _>(symbol("rtcIntersect16")?),
+                new_device: std::mem::transmute_copy(&symbol("rtcNewDevice")?),
+                new_scene: std::mem::transmute_copy(&symbol("rtcNewScene")?),
+                new_geometry: std::mem::transmute_copy(&symbol("rtcNewGeometry")?),
+                new_buffer: std::mem::transmute_copy(&symbol("rtcSetNewGeometryBuffer")?),
+                commit_geometry: std::mem::transmute_copy(&symbol("rtcCommitGeometry")?),
+                attach_geometry: std::mem::transmute_copy(&symbol("rtcAttachGeometry")?),
+                commit_scene: std::mem::transmute_copy(&symbol("rtcCommitScene")?),
+                occluded1: std::mem::transmute_copy(&symbol("rtcOccluded1")?),
+                occluded16: std::mem::transmute_copy(&symbol("rtcOccluded16")?),
+                intersect1: std::mem::transmute_copy(&symbol("rtcIntersect1")?),
+                intersect16: std::mem::transmute_copy(&symbol("rtcIntersect16")?),
             })
         }
     }

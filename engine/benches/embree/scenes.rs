@@ -3,7 +3,7 @@
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
-use engine::import::{GridSink, ImportOptions, import};
+use engine::import::{Copies, GridSink, ImportOptions, import};
 use engine::scene::{Procedural, ProceduralKind, UpAxis};
 use engine::stream::procedural::ProceduralStream;
 use engine::stream::{Microgrid, MicrogridStream, Schema};
@@ -48,8 +48,13 @@ impl MicrogridStream for MemoryStream {
 }
 
 impl GridSink for MemoryStream {
-    fn begin(&mut self, _: &Schema) -> engine::Result<()> {
+    fn begin(&mut self, _: &Schema, _: &[(String, String)]) -> engine::Result<()> {
         Ok(())
+    }
+
+    /// The files that are compared place nothing twice.
+    fn copies(&mut self, _: &Copies) -> engine::Result<()> {
+        Err(engine::Error::unsupported("copies are not compared"))
     }
 
     /// Takes the triangles and quads: geometry alone, and opaque, since that is what both sides are given.

@@ -159,6 +159,15 @@ impl Node {
         LatticeBox { min: corner(&self.lower), max: corner(&self.upper) }
     }
 
+    /// Half the extents of [`child_box`](Self::child_box).
+    #[inline(always)]
+    pub fn child_half(&self, slot: usize) -> glam::Vec3 {
+        glam::Vec3::from_array(std::array::from_fn(|axis| {
+            let scale = f32::from_bits((u32::from(self.exponent[axis]) + 127) << 23);
+            (f32::from(self.upper[axis][slot]) - f32::from(self.lower[axis][slot])) * (0.5 * scale)
+        }))
+    }
+
     /// The lower corner of [`child_box`](Self::child_box).
     #[inline(always)]
     pub fn lower_corner(&self, slot: usize) -> IVec3 {

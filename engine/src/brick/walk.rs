@@ -9,10 +9,11 @@ use glam::Vec3;
 
 use super::ALIGNMENT;
 use super::bundle::{Bundle, EXTINCTION_OPAQUE, RAYS_MAX};
+use super::far::{self, Aggregate, Plate, SeenBox};
 use super::intersect;
 use super::lanes::{Boxes, Corners, InstructionSet, Lanes, Planes, SLACK, plain::Plain, within};
 use super::leaf::{self, Kind, Layout};
-use super::node::{Child, FAR_BYTES, LOCATION_BITS, LOCATION_BYTES, Node, WIDTH};
+use super::node::{Child, LOCATION_BITS, LOCATION_BYTES, Node, WIDTH};
 
 /// Where a brick is, for the current batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,6 +82,7 @@ pub struct Scratch {
     stack: Vec<Entry>,
     lists: Vec<u16>,
     current: Vec<u16>,
+    far: Vec<u16>,
     masks: Vec<u8>,
     boxes: Boxes,
     corners: Corners,
@@ -116,6 +118,7 @@ impl Scratch {
             stack: Vec::with_capacity(256),
             lists: vec![0; 16 * RAYS_MAX],
             current: vec![0; RAYS_MAX + SLACK],
+            far: vec![0; RAYS_MAX + SLACK],
             masks: vec![0; RAYS_MAX + 2 * SLACK],
             boxes: Boxes {
                 center: [[0.0; WIDTH]; 3],
@@ -280,7 +283,10 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         let mut beyond = (0xff_u32 << node.count) as u8;
         let reach2 = self.bundle.reach * self.bundle.reach;
         for slot in 0..usize::from(node.count) {
-            far_mask |= u8::from(boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot]) << slot;
+            if boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot] && !far::must_open(&node.far[slot])
+            {
+                far_mask |= 1 << slot;
+            }
             beyond |= u8::from(boxes.distance2[slot] > reach2) << slot;
             // A node or leaf that will be visited is asked for before the rays are tested
             let child = node.children[slot];
@@ -317,7 +323,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             opened += 1;
         }
         if met & far_mask != 0 {
-            self.meet_far_fields(&node.far, met & far_mask, count);
+            // SAFETY: as the caller's
+            unsafe { self.meet_far_fields(node, met & far_mask, count) };
         }
         let mut first = entry.first as usize;
         for &key in &order[..opened] {
@@ -374,23 +381,60 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
     }
 
     /// Adds the extinction of the children in `far_mask` to the rays that meet their boxes.
+    ///
+    /// # Safety
+    /// The instruction set of `L` is available.
     #[inline(always)]
-    fn meet_far_fields(&mut self, far: &[[u8; FAR_BYTES]; WIDTH], far_mask: u8, count: usize) {
-        let extinctions = far.map(|far| face_extinction(u16::from_le_bytes([far[0], far[1]])));
-        for i in 0..count {
-            let mut met = self.scratch.masks[i] & far_mask;
-            if met == 0 {
-                continue;
+    unsafe fn meet_far_fields(&mut self, node: &Node, mut far_mask: u8, count: usize) {
+        while far_mask != 0 {
+            let slot = far_mask.trailing_zeros() as usize;
+            far_mask &= far_mask - 1;
+            let Scratch { current, masks, far, .. } = &mut *self.scratch;
+            // SAFETY: lists are long enough for all rays of a bundle and the slack
+            let met = unsafe { L::select(&current[..count], masks, slot, far) };
+            self.scratch.counts.far_hits += met as u64;
+            let (record, half) = (&node.far[slot], node.child_half(slot));
+            match far::kind(record) {
+                far::Kind::Single | far::Kind::Layered => self.meet_aggregate(record, half, met),
+                far::Kind::Plate => self.meet_plate(record, half, slot, met),
+                far::Kind::Scalar => {
+                    let extinction = face_extinction(u16::from_le_bytes([record[0], record[1]]));
+                    for &ray in &self.scratch.far[..met] {
+                        self.bundle.extinguish(ray, extinction);
+                    }
+                }
             }
-            let ray = self.scratch.current[i];
-            let mut extinction = 0;
-            while met != 0 {
-                extinction += extinctions[met.trailing_zeros() as usize];
-                self.scratch.counts.far_hits += 1;
-                met &= met - 1;
-            }
-            if !self.bundle.extinguish(ray, extinction) {
-                self.scratch.masks[i] = 0;
+        }
+    }
+
+    /// Adds an aggregate's extinction to the first `met` rays of the list.
+    #[inline(always)]
+    fn meet_aggregate(&mut self, record: &far::Record, half: Vec3, met: usize) {
+        let aggregate = Aggregate::decode(record);
+        for &ray in &self.scratch.far[..met] {
+            let direction = Vec3::from_slice(&self.bundle.directions[usize::from(ray)][..3]);
+            self.bundle.extinguish(ray, aggregate.extinction(direction, half));
+        }
+    }
+
+    /// Ends those of the first `met` rays of the list that meet a plate.
+    #[inline(never)]
+    fn meet_plate(&mut self, record: &far::Record, half: Vec3, slot: usize, met: usize) {
+        let plate = Plate::decode(record, half);
+        let center = Vec3::from_array(self.scratch.boxes.center.map(|center| center[slot]));
+        let mut at = 0;
+        for origin in 0..self.bundle.origins.len() {
+            let origin = self.bundle.origins[origin];
+            let offset = origin.position.wrapping_sub(self.bundle.reference).as_vec3();
+            let bounds = SeenBox { center: center - offset, half };
+            while at < met && self.scratch.far[at] < origin.end {
+                let ray = self.scratch.far[at];
+                let direction = Vec3::from_slice(&self.bundle.directions[usize::from(ray)][..3]);
+                let (enter, leave) = far::pass(direction, &bounds);
+                if plate.is_met(direction, &bounds, enter, leave) {
+                    self.bundle.extinguish(ray, EXTINCTION_OPAQUE);
+                }
+                at += 1;
             }
         }
     }
@@ -664,7 +708,10 @@ mod tests {
                 leaf::encode(&faces, 0, node.lower_corner(slot), &mut leaves);
                 all.extend(faces);
             }
-            (0..8).for_each(|slot| node.children[slot] = Child::Leaf(offsets[slot]).encode());
+            for slot in 0..8 {
+                node.children[slot] = Child::Leaf(offsets[slot]).encode();
+                node.far[slot] = std::array::from_fn(|_| random.next(256) as u8);
+            }
             boxes.push(leaf_boxes.iter().fold(LatticeBox::EMPTY, |b, &l| b.union(l)));
             let mut brick = Vec::new();
             assemble(number, &mut [node], &[], &leaves, 0, &mut brick);

@@ -3,6 +3,7 @@
 use glam::IVec3;
 
 use super::Arena;
+use crate::brick::far;
 use crate::brick::node::{Child, LatticeBox, Node};
 use crate::{Error, Result};
 
@@ -169,7 +170,11 @@ fn open_children(
 }
 
 /// Whether a child's diagonal is seen from the batch under at least the angle whose square is `open2`.
+/// A child that must be opened always is.
 fn is_open(node: &Node, slot: usize, batch: &LatticeBox, open2: f32) -> bool {
+    if far::must_open(&node.far[slot]) {
+        return true;
+    }
     let child = node.child_box(slot);
     let gap = (child.min - batch.max).max(batch.min - child.max).max(IVec3::ZERO).as_dvec3();
     let diagonal = (child.max - child.min).as_dvec3();
