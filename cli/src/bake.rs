@@ -23,7 +23,7 @@ pub struct Arguments {
     /// The folder of the results; made if it is not there
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// What traces: cpu, gpu[:N] (see `pantaray devices`), all (every GPU shares each batch), software (a slow adapter
+    /// What traces: cpu, gpu or gpu:N (see `pantaray devices`), all (every GPU shares each batch), software (a slow adapter
     /// for tests), or auto, which is the best GPU and the CPU where there is none
     #[arg(long, default_value = "auto", value_parser = str::parse::<Device>)]
     device: Device,

@@ -3,7 +3,7 @@
 //! [`adapter`] finds what the machine has, [`device`] opens it, [`shader`] joins the kernels from `shaders/`, [`records`] are
 //! what host and kernels share, [`mirror`] copies the arena, [`points`] are a batch's points, [`kernels`] are compiled and bound, [`runner`] runs
 //! dispatches of bounded time ([`pace`]), [`tracer`] drives a batch from its cut to its coefficients, and to the CPU where
-//! the device fails. [`bench`] measures an adapter's ceilings.
+//! the device fails. [`mod@bench`] measures an adapter's ceilings.
 
 pub mod adapter;
 pub mod bench;
