@@ -1,15 +1,12 @@
 //! Trees over boxes: a binary tree by the surface area heuristic, collapsed to eight-wide nodes of the least cost.
 //!
-//! Binned SAH (Wald, "On fast Construction of SAH-based Bounding Volume Hierarchies", 2007); the collapse is the dynamic
-//! program of Ylitie, Karras and Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", 2017,
-//! section 3. A leaf costs as much as a node.
+//! The binary tree ([`sah`]) ends where few enough primitives for one node are left. The collapse is the dynamic program of
+//! Ylitie, Karras and Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", 2017, section 3.
+//! A leaf costs as much as a node.
 
-use glam::Vec3;
-
+use super::sah::{self, Reference};
 use crate::brick::LatticeBox;
 use crate::brick::node::WIDTH;
-
-const BINS: usize = 16;
 
 /// A child of a wide node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,6 +26,13 @@ pub struct WideNode {
     pub count: u8,
 }
 
+impl WideNode {
+    fn push(&mut self, child: WideChild) {
+        self.children[usize::from(self.count)] = child;
+        self.count += 1;
+    }
+}
+
 /// A tree of wide nodes; node 0 is the root, children come after their parents.
 #[derive(Debug, Default)]
 pub struct WideTree {
@@ -39,151 +43,49 @@ pub struct WideTree {
 }
 
 /// A node of the binary tree. Children are neighbours.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Binary {
-    low: Vec3,
-    high: Vec3,
-    /// First child, or the primitive.
-    child: u32,
-    is_leaf: bool,
+    /// Half the area of its box.
+    area: f32,
+    /// First child, or first reference.
+    first: u32,
+    /// Primitives, 1 to 8; 0 if it has children.
+    primitives: u8,
 }
 
 /// Builds the tree over boxes; there must be at least one.
 pub fn build(boxes: &[LatticeBox]) -> WideTree {
-    let binary = build_binary(boxes);
-    collapse(&binary)
+    let base = boxes[0].min;
+    let mut references: Vec<Reference> =
+        boxes.iter().zip(0..).map(|(bounds, index)| Reference::new(bounds, base, 1, index)).collect();
+    let binary = build_binary(&mut references);
+    let plans = plan(&binary, &references);
+    collapse(&binary, &plans, &references)
 }
 
-fn half_area(low: Vec3, high: Vec3) -> f32 {
-    let size = (high - low).max(Vec3::ZERO);
-    size.x * size.y + size.y * size.z + size.z * size.x
-}
-
-/// A primitive on its way into the tree.
-#[derive(Clone, Copy, Debug)]
-struct Reference {
-    low: Vec3,
-    high: Vec3,
-    primitive: u32,
-}
-
-impl Reference {
-    fn center(&self) -> Vec3 {
-        self.low + self.high
-    }
-}
-
-fn build_binary(boxes: &[LatticeBox]) -> Vec<Binary> {
-    let mut references: Vec<Reference> = boxes
-        .iter()
-        .enumerate()
-        .map(|(i, b)| Reference { low: b.min.as_vec3(), high: b.max.as_vec3(), primitive: i as u32 })
-        .collect();
-    let mut nodes = Vec::with_capacity(2 * boxes.len());
-    let empty = Binary { low: Vec3::ZERO, high: Vec3::ZERO, child: 0, is_leaf: false };
-    nodes.push(empty);
+fn build_binary(references: &mut [Reference]) -> Vec<Binary> {
+    let mut nodes = Vec::with_capacity(references.len().div_ceil(2));
+    nodes.push(Binary::default());
     let mut stack = vec![(0_usize, 0..references.len())];
     while let Some((node, range)) = stack.pop() {
         let part = &mut references[range.clone()];
-        let (low, high) = extent(part, |r| (r.low, r.high));
-        if part.len() == 1 {
-            nodes[node] = Binary { low, high, child: part[0].primitive, is_leaf: true };
+        let area = sah::extent_half_area(part);
+        if part.len() <= WIDTH {
+            nodes[node] = Binary { area, first: range.start as u32, primitives: part.len() as u8 };
             continue;
         }
         let child = nodes.len();
-        nodes[node] = Binary { low, high, child: child as u32, is_leaf: false };
-        nodes.extend([empty; 2]);
-        let middle = range.start + split(part);
+        nodes[node] = Binary { area, first: child as u32, primitives: 0 };
+        nodes.extend([Binary::default(); 2]);
+        let middle = range.start + sah::split(part, WIDTH as u32);
         stack.push((child + 1, middle..range.end));
         stack.push((child, range.start..middle));
     }
     nodes
 }
 
-fn extent(part: &[Reference], of: impl Fn(&Reference) -> (Vec3, Vec3)) -> (Vec3, Vec3) {
-    part.iter()
-        .map(of)
-        .fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), (l, h)| (low.min(l), high.max(h)))
-}
-
-/// Puts the left half in front and returns its length, at least one and less than all.
-fn split(part: &mut [Reference]) -> usize {
-    if part.len() == 2 {
-        return 1;
-    }
-    let (low, high) = extent(part, |r| (r.center(), r.center()));
-    let size = high - low;
-    let mut best = (f32::INFINITY, 0, 0);
-    for axis in 0..3 {
-        if size[axis] > 0.0 {
-            let (cost, bin) = best_bin(part, axis, low[axis], BINS as f32 * 0.999_99 / size[axis]);
-            if cost < best.0 {
-                best = (cost, axis, bin);
-            }
-        }
-    }
-    let (cost, axis, bin) = best;
-    if cost.is_finite() {
-        let scale = BINS as f32 * 0.999_99 / size[axis];
-        let middle = partition(part, |r| ((r.center()[axis] - low[axis]) * scale) as usize <= bin);
-        if 0 < middle && middle < part.len() {
-            return middle;
-        }
-    }
-    // All in one place: halves keep the tree's depth logarithmic
-    part.len() / 2
-}
-
-/// The bin after which to split along an axis, and what that costs.
-fn best_bin(part: &[Reference], axis: usize, low: f32, scale: f32) -> (f32, usize) {
-    let mut counts = [0_u32; BINS];
-    let mut boxes = [(Vec3::INFINITY, Vec3::NEG_INFINITY); BINS];
-    for r in part {
-        let bin = (((r.center()[axis] - low) * scale) as usize).min(BINS - 1);
-        counts[bin] += 1;
-        boxes[bin] = (boxes[bin].0.min(r.low), boxes[bin].1.max(r.high));
-    }
-    let mut right = [f32::INFINITY; BINS];
-    let (mut count, mut all) = (0, (Vec3::INFINITY, Vec3::NEG_INFINITY));
-    for bin in (1..BINS).rev() {
-        count += counts[bin];
-        all = (all.0.min(boxes[bin].0), all.1.max(boxes[bin].1));
-        right[bin] = if count > 0 { count as f32 * half_area(all.0, all.1) } else { f32::INFINITY };
-    }
-    let mut best = (f32::INFINITY, 0);
-    (count, all) = (0, (Vec3::INFINITY, Vec3::NEG_INFINITY));
-    for bin in 0..BINS - 1 {
-        count += counts[bin];
-        all = (all.0.min(boxes[bin].0), all.1.max(boxes[bin].1));
-        if count > 0 {
-            let cost = count as f32 * half_area(all.0, all.1) + right[bin + 1];
-            if cost < best.0 {
-                best = (cost, bin);
-            }
-        }
-    }
-    best
-}
-
-/// Puts those for which `left` holds in front, keeps no order, and returns how many they are.
-fn partition(part: &mut [Reference], left: impl Fn(&Reference) -> bool) -> usize {
-    let (mut front, mut back) = (0, part.len());
-    loop {
-        while front < back && left(&part[front]) {
-            front += 1;
-        }
-        while front < back && !left(&part[back - 1]) {
-            back -= 1;
-        }
-        if front >= back {
-            return front;
-        }
-        part.swap(front, back - 1);
-    }
-}
-
 /// The cheapest ways to put a binary subtree into 1 to 7 slots of a wide node.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Plan {
     /// Cost with at most `i + 1` slots.
     cost: [f32; WIDTH - 1],
@@ -193,18 +95,22 @@ struct Plan {
     node_left: u8,
 }
 
-fn collapse(binary: &[Binary]) -> WideTree {
-    let root_area = half_area(binary[0].low, binary[0].high).max(f32::MIN_POSITIVE);
-    let mut plans = vec![Plan { cost: [0.0; WIDTH - 1], left: [0; WIDTH - 1], node_left: 0 }; binary.len()];
+/// Plans for every node of the binary tree.
+fn plan(binary: &[Binary], references: &[Reference]) -> Vec<Plan> {
+    let mut plans = vec![Plan::default(); binary.len()];
     // Children come after their parents: backwards is bottom up
-    for index in (0..binary.len()).rev() {
-        let node = &binary[index];
-        let area = half_area(node.low, node.high);
-        if node.is_leaf {
-            plans[index].cost = [area; WIDTH - 1];
+    for (index, node) in binary.iter().enumerate().rev() {
+        let first = node.first as usize;
+        if node.primitives > 0 {
+            // As a node of its own, or every primitive in a slot
+            let count = usize::from(node.primitives);
+            let inside = references[first..first + count].iter().map(Reference::half_area).sum::<f32>();
+            let own = if count == 1 { inside } else { node.area + inside };
+            plans[index].cost =
+                std::array::from_fn(|slots| if slots + 1 < count { own } else { inside.min(own) });
             continue;
         }
-        let (left, right) = (plans[node.child as usize].cost, plans[node.child as usize + 1].cost);
+        let (left, right) = (plans[first].cost, plans[first + 1].cost);
         let distribute = |slots: usize| {
             (1..slots)
                 .map(|k| (left[k.min(7) - 1] + right[(slots - k).min(7) - 1], k as u8))
@@ -213,53 +119,60 @@ fn collapse(binary: &[Binary]) -> WideTree {
         let plan = &mut plans[index];
         let (inside, node_left) = distribute(WIDTH);
         plan.node_left = node_left;
-        plan.cost[0] = area + inside;
+        plan.cost[0] = node.area + inside;
         for slots in 2..WIDTH {
             let (cost, k) = distribute(slots);
             let fewer = plan.cost[slots - 2];
             (plan.cost[slots - 1], plan.left[slots - 1]) = if cost < fewer { (cost, k) } else { (fewer, 0) };
         }
     }
+    plans
+}
 
-    // Emit the nodes top down
+/// Emits the wide nodes, parents first.
+fn collapse(binary: &[Binary], plans: &[Plan], references: &[Reference]) -> WideTree {
+    let root_area = binary[0].area.max(f32::MIN_POSITIVE);
     let mut tree = WideTree { nodes: Vec::new(), cost: f64::from(plans[0].cost[0] / root_area) };
     let unused = WideNode { children: [WideChild::Primitive(u32::MAX); WIDTH], count: 0 };
     tree.nodes.push(unused);
-    let mut queue = std::collections::VecDeque::from([(0_u32, 0_u32)]);
-    while let Some((from, to)) = queue.pop_front() {
+    let mut sources = vec![0_u32];
+    let mut pending = Vec::with_capacity(2 * WIDTH);
+    let mut at = 0;
+    while at < sources.len() {
         let mut wide = unused;
         // Subtrees with the slots they may take, leftmost on top
-        let mut pending = Vec::with_capacity(WIDTH);
-        if binary[from as usize].is_leaf {
-            pending.push((from, 1));
+        let (node, plan) = (&binary[sources[at] as usize], &plans[sources[at] as usize]);
+        if node.primitives > 0 {
+            pending.push((sources[at], WIDTH));
         } else {
-            let child = binary[from as usize].child;
-            let left = usize::from(plans[from as usize].node_left);
-            pending.extend([(child + 1, WIDTH - left), (child, left)]);
+            let left = usize::from(plan.node_left);
+            pending.extend([(node.first + 1, WIDTH - left), (node.first, left)]);
         }
         while let Some((index, slots)) = pending.pop() {
             let (node, plan) = (&binary[index as usize], &plans[index as usize]);
+            let count = usize::from(node.primitives);
+            if count > 0 && count <= slots {
+                for r in &references[node.first as usize..node.first as usize + count] {
+                    wide.push(WideChild::Primitive(r.index()));
+                }
+                continue;
+            }
             // Fewer slots may do
             let mut slots = slots.min(WIDTH - 1);
             while slots > 1 && plan.left[slots - 1] == 0 {
                 slots -= 1;
             }
-            if !node.is_leaf && slots > 1 {
+            if slots > 1 {
                 let left = usize::from(plan.left[slots - 1]);
-                pending.extend([(node.child + 1, slots - left), (node.child, left)]);
+                pending.extend([(node.first + 1, slots - left), (node.first, left)]);
                 continue;
             }
-            wide.children[usize::from(wide.count)] = if node.is_leaf {
-                WideChild::Primitive(node.child)
-            } else {
-                let number = tree.nodes.len() as u32;
-                tree.nodes.push(unused);
-                queue.push_back((index, number));
-                WideChild::Node(number)
-            };
-            wide.count += 1;
+            wide.push(WideChild::Node(tree.nodes.len() as u32));
+            tree.nodes.push(unused);
+            sources.push(index);
         }
-        tree.nodes[to as usize] = wide;
+        tree.nodes[at] = wide;
+        at += 1;
     }
     tree
 }

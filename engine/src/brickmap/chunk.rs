@@ -1,18 +1,28 @@
 //! From the microgrids of a partition to full leaves: what the tree is built over.
 //!
-//! A micropolygon is never a primitive of its own. Regular grids are cut into tiles of up to eight quads, as square as
-//! their cells allow; other grids by balanced splits at multiples of eight faces; the faces of tiny grids are pooled first,
-//! so that soups fill their leaves too.
+//! A micropolygon is never a primitive of its own. Pieces of a grid whose faces lie in rows ([`block`]) are cut into tiles
+//! of up to eight quads, as square as their cells allow. All other faces are gathered into full leaves ([`cluster`]):
+//! those of a grid among themselves where they are many and close together, the rest of the partition together.
 
 use glam::{IVec3, Vec3};
 
+use super::block::{Block, blocks};
+use super::cluster::{Item, cluster};
+use super::farfield;
 use super::pack::{Content, Primitive};
 use super::spill::Quantised;
+use super::tiling::Tilings;
 use crate::brick::LatticeBox;
 use crate::brick::leaf::{self, FACES_MAX, Face, OPAQUE};
 
-/// Grids of fewer faces than this are pooled.
-const SMALL_GRID_FACES: usize = 2 * FACES_MAX;
+/// Blocks of fewer quads than this are gathered with others.
+const BLOCK_FACES_MIN: usize = 6;
+
+/// Loose faces of a grid that make leaves of their own.
+const LOOSE_FACES_MIN: usize = 4 * FACES_MAX;
+
+/// How many times larger than its faces' boxes together the box of a grid may be for them to count as close together.
+const SPARSE_MAX: f32 = 8.0;
 
 /// What was left out of a partition.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -34,47 +44,121 @@ pub struct Chunk {
     pub leaves: Vec<u8>,
     /// What was left out.
     pub skipped: Skipped,
-    /// Faces of tiny grids: flat ones and round ones, each with its geometry's shift.
-    pools: [Vec<(u8, Face)>; 2],
+    /// Faces that are in no tile: flat ones and round ones, of the grid at hand.
+    loose: [Loose; 2],
+    /// The same, of grids that have few or scattered ones.
+    pools: [Loose; 2],
+    blocks: Vec<Block>,
+    tilings: Tilings,
+}
+
+/// Faces in items that stay together.
+#[derive(Debug, Default)]
+struct Loose {
     faces: Vec<Face>,
-    order: Vec<u32>,
-    centers: Vec<Vec3>,
+    /// Lattice shift of each face's geometry.
+    shifts: Vec<u8>,
+    items: Vec<Item>,
+}
+
+impl Loose {
+    fn clear(&mut self) {
+        self.faces.clear();
+        self.shifts.clear();
+        self.items.clear();
+    }
+
+    /// Makes one item of the faces from `first` on, or one of each.
+    fn add_items(&mut self, first: usize, together: bool, shift: u8) {
+        let step = if together { self.faces.len() - first } else { 1 };
+        for (number, faces) in self.faces[first..].chunks(step.max(1)).enumerate() {
+            self.items.push(Item::new((first + number * step) as u32, faces));
+        }
+        self.shifts.resize(self.faces.len(), shift);
+    }
+
+    /// Moves everything to `pool`.
+    fn move_to(&mut self, pool: &mut Self) {
+        let base = pool.faces.len() as u32;
+        pool.items.extend(self.items.iter().map(|item| Item { first: item.first + base, ..*item }));
+        pool.faces.append(&mut self.faces);
+        pool.shifts.append(&mut self.shifts);
+        self.items.clear();
+    }
+
+    /// Whether the faces are few, or far from each other for their size.
+    fn is_scattered(&self) -> bool {
+        if self.faces.len() < LOOSE_FACES_MIN {
+            return true;
+        }
+        let bounds = self.items.iter().fold(LatticeBox::EMPTY, |all, item| all.union(item.bounds));
+        let sum: f32 = self.items.iter().map(|item| half_area(&item.bounds)).sum();
+        half_area(&bounds) > SPARSE_MAX * sum
+    }
+}
+
+fn half_area(bounds: &LatticeBox) -> f32 {
+    let size = (bounds.max - bounds.min).as_vec3();
+    size.x * size.y + size.y * size.z + size.z * size.x
 }
 
 impl Chunk {
     /// Adds a grid.
     pub fn add(&mut self, grid: &Quantised) {
-        if grid.columns > 0 && grid.arities.len() >= FACES_MAX {
-            self.add_regular(grid);
-            return;
+        let mut found = std::mem::take(&mut self.blocks);
+        blocks(grid, &mut found);
+        for block in &found {
+            if block.faces() >= BLOCK_FACES_MIN {
+                self.add_tiles(grid, block);
+            } else {
+                self.add_loose(grid, block);
+            }
         }
-        let mut faces = std::mem::take(&mut self.faces);
-        faces.clear();
-        let mut at = 0;
-        for face in 0..grid.arities.len() {
-            faces.extend(self.face(grid, face, at));
-            at += usize::from(grid.arities[face]);
+        self.blocks = found;
+        for kind in 0..2 {
+            let mut loose = std::mem::take(&mut self.loose[kind]);
+            if loose.is_scattered() {
+                loose.move_to(&mut self.pools[kind]);
+            } else {
+                self.gather(&loose);
+                loose.clear();
+            }
+            self.loose[kind] = loose;
         }
-        if faces.len() < SMALL_GRID_FACES {
-            faces.iter().for_each(|&face| self.pools[usize::from(face.is_round())].push((grid.shift, face)));
-        } else {
-            // Points and lines come last, so that leaves are all flat or all round
-            faces.sort_by_key(Face::is_round);
-            let flat = faces.partition_point(|face| !face.is_round());
-            self.split(&faces[..flat], grid.shift);
-            self.split(&faces[flat..], grid.shift);
-        }
-        self.faces = faces;
     }
 
     /// Makes leaves of the pooled faces, and room for those who read past the last leaf. Call it once, at the end.
     pub fn finish(&mut self) {
-        for mut pool in std::mem::take(&mut self.pools) {
-            pool.sort_by_key(|&(shift, _)| shift);
-            for run in pool.chunk_by(|a, b| a.0 == b.0) {
-                let faces: Vec<Face> = run.iter().map(|&(_, face)| face).collect();
-                self.split(&faces, run[0].0);
+        for pool in std::mem::take(&mut self.pools) {
+            self.gather(&pool);
+        }
+    }
+
+    /// Makes leaves of loose faces.
+    fn gather(&mut self, loose: &Loose) {
+        let mut faces = Vec::with_capacity(leaf::TRIANGLES_MAX);
+        cluster(&loose.items, &loose.faces, |members| {
+            faces.clear();
+            faces.extend(members.iter().map(|&member| loose.faces[member as usize]));
+            let shift = members.iter().map(|&member| loose.shifts[member as usize]).min();
+            self.push(&faces, shift.expect("a leaf has a face"));
+        });
+    }
+
+    /// Adds the faces of a block to those that are gathered: together if they are all quads, else one by one.
+    fn add_loose(&mut self, grid: &Quantised, block: &Block) {
+        let mut together = block.faces() > 1;
+        let firsts = self.loose.each_ref().map(|loose| loose.faces.len());
+        let mut at = block.corner;
+        for number in block.face..block.face + block.faces() {
+            if let Some(face) = self.face(grid, number, at) {
+                together &= face.arity == 4;
+                self.loose[usize::from(face.is_round())].faces.push(face);
             }
+            at += usize::from(grid.arities[number]);
+        }
+        for (loose, first) in self.loose.iter_mut().zip(firsts) {
+            loose.add_items(first, together, grid.shift);
         }
         self.leaves.extend_from_slice(&[0; leaf::READ_PAST_BYTES]);
     }
@@ -101,11 +185,7 @@ impl Chunk {
             if count > 1 && vertices[count - 1] == vertices[0] {
                 count -= 1;
             }
-            let has_area = |a: usize, b: usize, c: usize| {
-                let (u, v) = ((vertices[b] - vertices[a]).as_dvec3(), (vertices[c] - vertices[a]).as_dvec3());
-                u.cross(v) != glam::DVec3::ZERO
-            };
-            if count < 3 || !(has_area(0, 1, 2) || count == 4 && has_area(0, 2, 3)) {
+            if count < 3 || !(has_area(&vertices, 1) || count == 4 && has_area(&vertices, 2)) {
                 self.skipped.degenerate += 1;
                 return None;
             }
@@ -124,143 +204,111 @@ impl Chunk {
         Some(Face { vertices, arity: count as u8, extinction, radii })
     }
 
-    /// Cuts a regular grid into tiles of up to eight quads.
-    fn add_regular(&mut self, grid: &Quantised) {
-        let columns = usize::from(grid.columns);
-        let rows = grid.arities.len() / columns;
-        let (tile_columns, tile_rows) = tile_shape(grid, columns, rows);
-        for row in (0..rows).step_by(tile_rows) {
-            for column in (0..columns).step_by(tile_columns) {
-                let (across, down) = ((columns - column).min(tile_columns), (rows - row).min(tile_rows));
-                let (mut faces, mut count) = ([None; FACES_MAX], 0);
-                for r in row..row + down {
-                    for c in column..column + across {
-                        let face = r * columns + c;
-                        faces[count] = self.face(grid, face, 4 * face);
-                        count += usize::from(faces[count].is_some());
-                    }
-                }
-                let Some(first) = faces[0] else { continue };
-                let faces = faces.map(|face| face.unwrap_or(first));
-                let faces = &faces[..count];
-                if count == across * down && faces.iter().all(|face| face.arity == 4) {
-                    self.push_tile(grid, faces, [column, row, across, down]);
-                } else {
-                    self.push(faces, grid.shift);
-                }
+    /// Cuts a block into tiles of up to eight quads.
+    fn add_tiles(&mut self, grid: &Quantised, block: &Block) {
+        let mut tilings = std::mem::take(&mut self.tilings);
+        for tile in tilings.tiles(block.columns, block.rows, block.cell(&grid.vertices)) {
+            let tile = block.part(tile.columns(), tile.rows());
+            if !self.push_tile(grid, &tile) {
+                self.push_remains(grid, &tile);
             }
         }
+        self.tilings = tilings;
     }
 
-    /// Encodes a whole tile of a regular grid: its first column and row, quads across and down.
-    fn push_tile(&mut self, grid: &Quantised, faces: &[Face], [column, row, across, down]: [usize; 4]) {
-        let wide = usize::from(grid.columns) + 1;
+    /// Encodes a tile unless some of its faces are missing or no quads.
+    fn push_tile(&mut self, grid: &Quantised, tile: &Block) -> bool {
+        // Copy its rows of vertices
+        let wide = tile.columns + 1;
         let (mut vertices, mut count) = ([IVec3::ZERO; leaf::VERTICES_MAX], 0);
-        for r in row..=row + down {
-            let start = r * wide + column;
-            vertices[count..count + across + 1].copy_from_slice(&grid.vertices[start..start + across + 1]);
-            count += across + 1;
+        for row in 0..=tile.rows {
+            let start = tile.vertex + row * tile.stride;
+            vertices[count..count + wide].copy_from_slice(&grid.vertices[start..start + wide]);
+            count += wide;
         }
-        let (mut extinctions, offset) = ([0; FACES_MAX], self.leaves.len());
-        faces.iter().zip(&mut extinctions).for_each(|(face, extinction)| *extinction = face.extinction);
-        let (extinctions, bounds) = (&extinctions[..faces.len()], bounds(faces));
-        leaf::encode_tile(&vertices[..count], across, extinctions, grid.shift, bounds.min, &mut self.leaves);
-        self.record(faces, bounds, offset);
-    }
+        let vertices = &vertices[..count];
+        let mut bounds = LatticeBox::EMPTY;
+        vertices.iter().for_each(|&vertex| bounds.add(vertex));
 
-    /// Cuts faces into leaves by balanced splits at multiples of eight along the longest axis.
-    fn split(&mut self, faces: &[Face], shift: u8) {
-        if faces.is_empty() {
-            return;
-        }
-        let mut centers = std::mem::take(&mut self.centers);
-        let mut order = std::mem::take(&mut self.order);
-        centers.clear();
-        centers.extend(faces.iter().map(|face| {
-            let bounds = face.bounds();
-            bounds.min.as_vec3() + bounds.max.as_vec3()
-        }));
-        order.clear();
-        order.extend(0..faces.len() as u32);
-        let mut stack = vec![0..faces.len()];
-        while let Some(range) = stack.pop() {
-            let part = &mut order[range.clone()];
-            if part.len() <= FACES_MAX {
-                part.sort_unstable();
-                let mut leaf = [faces[part[0] as usize]; FACES_MAX];
-                part.iter().enumerate().for_each(|(i, &face)| leaf[i] = faces[face as usize]);
-                self.push(&leaf[..part.len()], shift);
-                continue;
+        // Sum up areas; where rounding could hide that there is none, the faces are looked at one by one
+        let size = (bounds.max - bounds.min).as_vec3();
+        let least = 1e-6 * size.length_squared();
+        let (mut extinctions, mut faces) = ([OPAQUE; FACES_MAX], 0);
+        let (mut area, mut opaque_area) = (0.0, 0.0);
+        for row in 0..tile.rows {
+            for column in 0..tile.columns {
+                let a = row * wide + column;
+                let edge = |to: usize| (vertices[to] - vertices[a]).as_vec3();
+                let (b, c, d) = (edge(a + 1), edge(a + wide + 1), edge(a + wide));
+                let (lower, upper) = (triangle(b, c), triangle(c, d));
+                if lower <= least || upper <= least {
+                    return false;
+                }
+                let face_area = lower + upper;
+                area += face_area;
+                if grid.extinctions.is_empty() {
+                    opaque_area += face_area;
+                } else {
+                    extinctions[faces] = grid.extinctions[tile.face_at(column, row)];
+                    if extinctions[faces] == 0 {
+                        return false;
+                    }
+                    opaque_area += face_area * farfield::opacity(extinctions[faces]);
+                }
+                faces += 1;
             }
-            let corner = centers[part[0] as usize];
-            let (low, high) = part
-                .iter()
-                .map(|&face| centers[face as usize])
-                .fold((corner, corner), |(low, high), c| (low.min(c), high.max(c)));
-            let size = high - low;
-            let axis = if size.x >= size.y.max(size.z) {
-                0
-            } else if size.y >= size.z {
-                1
-            } else {
-                2
-            };
-            let middle = (part.len() / 2).next_multiple_of(FACES_MAX);
-            let key = |face: u32| (centers[face as usize][axis], face);
-            part.select_nth_unstable_by(middle, |&a, &b| {
-                key(a).partial_cmp(&key(b)).expect("lattice coordinates are numbers")
-            });
-            stack.push(range.start + middle..range.end);
-            stack.push(range.start..range.start + middle);
         }
-        (self.centers, self.order) = (centers, order);
+        let offset = self.leaves.len();
+        let extinctions = &extinctions[..faces];
+        leaf::encode_tile(vertices, tile.columns, extinctions, grid.shift, bounds.min, &mut self.leaves);
+        self.record(bounds, [area, opaque_area], faces, offset);
+        true
     }
 
-    /// Encodes a leaf.
+    /// Makes a leaf of those faces of a tile that are there.
+    fn push_remains(&mut self, grid: &Quantised, tile: &Block) {
+        let (mut faces, mut count) = ([None; FACES_MAX], 0);
+        for row in 0..tile.rows {
+            for column in 0..tile.columns {
+                let face = tile.face_at(column, row);
+                faces[count] = self.face(grid, face, tile.corner_of(face));
+                count += usize::from(faces[count].is_some());
+            }
+        }
+        if let Some(first) = faces[0] {
+            self.push(&faces.map(|face| face.unwrap_or(first))[..count], grid.shift);
+        }
+    }
+
+    /// Encodes a leaf. Until it is packed, it is relative to its own box.
     fn push(&mut self, faces: &[Face], shift: u8) {
+        let (mut bounds, mut area, mut opaque_area) = (LatticeBox::EMPTY, 0.0, 0.0);
+        for face in faces {
+            bounds = bounds.union(face.bounds());
+            let face_area = farfield::area(face);
+            area += face_area;
+            opaque_area += face_area * farfield::opacity(face.extinction);
+        }
         let offset = self.leaves.len();
-        let bounds = bounds(faces);
         leaf::encode(faces, shift, bounds.min, &mut self.leaves);
-        self.record(faces, bounds, offset);
+        self.record(bounds, [area, opaque_area], faces.len(), offset);
     }
 
     /// Notes the leaf that was encoded from `offset` on.
-    fn record(&mut self, faces: &[Face], bounds: LatticeBox, offset: usize) {
-        let (mut area, mut opaque_area) = (0.0, 0.0);
-        for face in faces {
-            let face_area = super::farfield::area(face);
-            area += face_area;
-            opaque_area += face_area * super::farfield::opacity(face.extinction);
-        }
-        self.clusters.push(Primitive {
-            bounds,
-            area,
-            opaque_area,
-            micropolygons: faces.len() as u64,
-            content: Content::Leaf { offset: offset as u32, bytes: (self.leaves.len() - offset) as u32 },
-        });
+    fn record(&mut self, bounds: LatticeBox, [area, opaque_area]: [f32; 2], faces: usize, offset: usize) {
+        let content = Content::Leaf { offset: offset as u32, bytes: (self.leaves.len() - offset) as u32 };
+        self.clusters.push(Primitive { bounds, area, opaque_area, micropolygons: faces as u64, content });
     }
 }
 
-/// The box of a leaf's faces; until the leaf is packed, it is encoded relative to this box's lower corner.
-fn bounds(faces: &[Face]) -> LatticeBox {
-    faces.iter().fold(LatticeBox::EMPTY, |bounds, face| bounds.union(face.bounds()))
+/// Whether the triangle of the first, the `second` and the next vertex has an area. Exact: differences have 31 bits, so that
+/// products and their rounded differences are zero only where the true ones are.
+fn has_area(vertices: &[IVec3; 4], second: usize) -> bool {
+    let edge = |to: usize| (vertices[to] - vertices[0]).as_i64vec3();
+    let (u, v) = (edge(second), edge(second + 1));
+    u.x * v.y != u.y * v.x || u.y * v.z != u.z * v.y || u.z * v.x != u.x * v.z
 }
 
-/// Quads across and down of a tile of eight, or fewer, that is nearly square and fills the grid well.
-fn tile_shape(grid: &Quantised, columns: usize, rows: usize) -> (usize, usize) {
-    let wide = columns + 1;
-    let middle = (rows / 2) * wide + columns / 2;
-    let at = |index: usize| grid.vertices[index].as_vec3();
-    let last = grid.vertices.len() - 1;
-    let across = at(middle).distance(at((middle + 1).min(last))).max(1.0);
-    let down = at(middle).distance(at((middle + wide).min(last))).max(1.0);
-    let cost = |&(c, r): &(usize, usize)| {
-        let (width, height) = (across * c.min(columns) as f32, down * r.min(rows) as f32);
-        let tiles = columns.div_ceil(c) * rows.div_ceil(r);
-        // Perimeter of a tile for how square it is, times how many are needed
-        (width + height) / (width * height).sqrt() * tiles as f32
-    };
-    let shapes = [(4, 2), (2, 4), (8, 1), (1, 8)];
-    shapes.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).expect("there are four")
+fn triangle(u: Vec3, v: Vec3) -> f32 {
+    0.5 * u.cross(v).length()
 }

@@ -10,11 +10,13 @@
 //! All threads share both passes and the partitions. The bytes depend on the occluders and the build parameters alone, not
 //! on threads, memory or interruptions.
 
+mod block;
 pub mod bucket;
 mod budget;
 pub mod bvh;
 mod census;
 pub mod chunk;
+mod cluster;
 pub mod farfield;
 pub mod file;
 mod fill;
@@ -23,7 +25,9 @@ mod log;
 mod output;
 pub mod pack;
 mod partition;
+mod sah;
 pub mod spill;
+mod tiling;
 mod writer;
 
 use std::path::{Path, PathBuf};
