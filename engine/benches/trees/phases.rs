@@ -6,7 +6,7 @@ use engine::brick::LatticeBox;
 use engine::brick::lattice::{Lattice, exponent_for_edge};
 use engine::brickmap::bvh;
 use engine::brickmap::chunk::Chunk;
-use engine::brickmap::pack::{Packed, pack};
+use engine::brickmap::pack::{Far, Packed, pack};
 use engine::brickmap::spill::Quantised;
 use engine::math::Bounds;
 use engine::stream::{Microgrid, MicrogridStream};
@@ -46,7 +46,7 @@ fn run(spill: &[u8]) -> [f64; PARTS.len()] {
     let tree = bvh::build(&boxes);
     lap(3);
     let mut packed = Packed::default();
-    pack(&tree, &chunk.clusters, &chunk.leaves, 0, &mut packed);
+    pack(&tree, &chunk.clusters, &chunk.leaves, 0, Far::Paper, &mut packed);
     lap(4);
     seconds
 }

@@ -20,8 +20,8 @@ const CUTS_MAX: u32 = 6;
 const TABLES_MAX: usize = 4;
 
 /// Bytes that building a partition takes for every micropolygon at most, its bricks included: a face that lies in no rows
-/// is gathered as a face of 60 bytes, an item and a reference of 32 each;
-/// the far field keeps its sums and lines beside them.
+/// is gathered as a face of 60 bytes, an item and a reference of 32 each; the far
+/// field keeps its sums beside them.
 const BYTES_PER_MICROPOLYGON: u64 = 220;
 
 /// Builds what was spilled and writes it. `done` partitions are written already.
