@@ -65,6 +65,24 @@ impl Desk {
         let whole = found.iter().find(|name| !name.starts_with('.')).map(|name| folder.join(name));
         (found, whole)
     }
+
+    /// Waits until a build that writes to `out` has finished a few partitions.
+    fn wait_for_partitions(&self, out: &str, child: &mut Child) {
+        let folder = Path::new(&self.at(out)).join("brickmap");
+        let journal = || {
+            let unfinished = std::fs::read_dir(&folder).ok()?.next()?.ok()?.path();
+            Some(std::fs::metadata(unfinished.join("journal")).ok()?.len())
+        };
+        let start = Instant::now();
+        while journal().is_none_or(|bytes| bytes < 1000) {
+            assert!(
+                child.try_wait().expect("a child").is_none(),
+                "the build ended before it could be stopped"
+            );
+            assert!(start.elapsed() < Duration::from_secs(120), "no partition was finished");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
 }
 
 /// Every file of a folder, by name.
@@ -89,7 +107,7 @@ fn a_build_that_is_killed_at_ten_moments_continues_to_the_same_bytes() {
     let whole = start.elapsed();
     let expected = only_map(&desk, "quiet");
 
-    let (mut kills, mut runs, mut continued) = (0, 0, 0);
+    let (mut kills, mut runs) = (0, 0);
     while kills < 10 {
         runs += 1;
         assert!(runs < 60, "builds end before they can be killed");
@@ -120,13 +138,21 @@ fn a_build_that_is_killed_at_ten_moments_continues_to_the_same_bytes() {
             assert!(files(&scratch).iter().all(|(_, bytes)| bytes.is_empty()), "scratch is left");
         }
         if kills % 3 == 0 {
-            let report = desk.build("killed");
-            continued += report["brickmap"]["partitions_continued"].as_u64().expect("a count");
+            desk.build("killed");
             assert!(only_map(&desk, "killed") == expected, "other bytes after {kills} kills");
             std::fs::remove_dir_all(desk.at("killed")).unwrap();
         }
     }
-    assert!(continued > 0, "no partition was ever kept");
+
+    // One more, when it is known that partitions are done
+    let mut child = desk.spawn("late");
+    desk.wait_for_partitions("late", &mut child);
+    child.kill().expect("killed");
+    assert!(!child.wait().expect("an end").success());
+    let report = desk.build("late");
+    let continued = report["brickmap"]["partitions_continued"].as_u64().expect("a count");
+    assert!(continued > 0, "no partition was kept");
+    assert!(only_map(&desk, "late") == expected, "other bytes after a late kill");
 }
 
 /// Catches a polite stop that leaves scratch, loses what is done, or does not say how to go on.
@@ -134,17 +160,7 @@ fn a_build_that_is_killed_at_ten_moments_continues_to_the_same_bytes() {
 fn a_build_that_is_cancelled_keeps_its_partitions() {
     let desk = Desk::with(&scene(MICROPOLYGONS, UNMOVED, 16));
     let mut child = desk.spawn("stopped");
-    let folder = Path::new(&desk.at("stopped")).join("brickmap");
-    let journal = || {
-        let unfinished = std::fs::read_dir(&folder).ok()?.next()?.ok()?.path();
-        Some(std::fs::metadata(unfinished.join("journal")).ok()?.len())
-    };
-    let start = Instant::now();
-    while journal().is_none_or(|bytes| bytes < 1000) {
-        assert!(child.try_wait().expect("a child").is_none(), "the build ended before it could be stopped");
-        assert!(start.elapsed() < Duration::from_secs(120), "no partition was finished");
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    desk.wait_for_partitions("stopped", &mut child);
     let kill = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().expect("kill runs");
     assert!(kill.success());
     let cancelled = Run::from(child.wait_with_output().expect("an end"));

@@ -132,6 +132,7 @@ impl Chunk {
         for pool in std::mem::take(&mut self.pools) {
             self.gather(&pool);
         }
+        self.leaves.extend_from_slice(&[0; leaf::READ_PAST_BYTES]);
     }
 
     /// Makes leaves of loose faces.
@@ -160,7 +161,6 @@ impl Chunk {
         for (loose, first) in self.loose.iter_mut().zip(firsts) {
             loose.add_items(first, together, grid.shift);
         }
-        self.leaves.extend_from_slice(&[0; leaf::READ_PAST_BYTES]);
     }
 
     /// A face of a grid whose indices start at `at`; none if it is degenerate, counted.
