@@ -1,6 +1,6 @@
 //! From the microgrids of a partition to full leaves: what the tree is built over.
 //!
-//! A micropolygon is never a primitive of its own. Pieces of a grid whose faces lie in rows ([`block`]) are cut into tiles
+//! A micropolygon is never a primitive of its own. Pieces of a grid whose faces lie in rows ([`block`](super::block)) are cut into tiles
 //! of up to eight quads, as square as their cells allow. All other faces are gathered into full leaves ([`cluster`]):
 //! those of a grid among themselves where they are many and close together, the rest of the partition together.
 
