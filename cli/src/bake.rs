@@ -35,9 +35,10 @@ pub struct Arguments {
     /// How far bricks are opened: `off` (all the way), `paper`, or `footprint[:Q]`, down to Q footprints of a ray
     #[arg(long, value_name = "LOD", default_value = "off", value_parser = parse_lod)]
     lod: Lod,
-    /// What stands in for what is not opened: paper
-    #[arg(long, value_name = "KIND", default_value = "paper", value_parser = Far::parse)]
-    farfield: Far,
+    /// What stands in for what is not opened: `paper` (the paper's sums of areas, fast to build) or `directional` (from lines
+    /// through the geometry; does not leak)
+    #[arg(long, value_name = "KIND", default_value = "paper", value_parser = str::parse::<FarField>)]
+    farfield: FarField,
     /// Turns every point's rays differently; the same seed gives the same bytes
     #[arg(long, value_name = "S", default_value_t = 0)]
     seed: u64,
@@ -78,7 +79,7 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
     let options = BakeOptions {
         device: arguments.device,
         lod: arguments.lod,
-        far_field: arguments.farfield.check()?,
+        far_field: arguments.farfield,
         seed: arguments.seed,
         samples: arguments.samples,
         points_max: arguments.max_points,
@@ -170,34 +171,6 @@ fn describe_set(set: &BakeSetReport) -> String {
         figures::seconds(set.split_seconds),
         figures::seconds(set.merge_seconds),
     )
-}
-
-/// What stands in for what is not opened.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Far {
-    Paper,
-    /// Known to the grammar, not to this version.
-    Directional,
-}
-
-impl Far {
-    /// Reads `paper` or `directional`.
-    pub fn parse(text: &str) -> Result<Self, String> {
-        match text {
-            "paper" => Ok(Self::Paper),
-            "directional" => Ok(Self::Directional),
-            _ => Err("expected `paper`".into()),
-        }
-    }
-
-    /// The far field, if this version has it.
-    pub fn check(self) -> Result<FarField> {
-        match self {
-            Self::Paper => Ok(FarField::Paper),
-            Self::Directional => Err(Error::unsupported("the far field `directional` is not supported yet")
-                .hint("use `--farfield paper`, or leave it out")),
-        }
-    }
 }
 
 /// Reads a level of detail; a wrong one is wrong usage.

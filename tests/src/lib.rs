@@ -13,7 +13,7 @@ use engine::cut::{Arena, Lod};
 use engine::scene::ShOcclusion;
 use engine::stream::{Attribute, Microgrid, MicrogridStream, Schema, ValueType};
 use engine::trace::{Shading, SphericalTracer, TraceOptions};
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec3};
 
 /// A stream in memory.
 #[derive(Clone, Debug, Default)]
@@ -110,6 +110,19 @@ impl MemoryStream {
         });
     }
 
+    /// Adds a room of 2 units in each direction about the origin, its walls of `cells` x `cells` quads, turned by `tilt`
+    /// radians about two axes; returns the turn.
+    pub fn push_room(&mut self, tilt: f64, cells: usize) -> DMat3 {
+        let turn = DMat3::from_rotation_z(tilt) * DMat3::from_rotation_x(0.7 * tilt);
+        for axis in 0..3 {
+            let (n, u, v) = (turn.col(axis), turn.col((axis + 1) % 3), turn.col((axis + 2) % 3));
+            for side in [-1.0, 1.0] {
+                self.push_sheet(side * n - u - v, 2.0 * u, 2.0 * v, cells, 1.0);
+            }
+        }
+        turn
+    }
+
     /// Moves everything.
     pub fn translate(&mut self, by: DVec3) {
         self.grids.iter_mut().for_each(|grid| grid.anchor += by);
@@ -143,14 +156,23 @@ impl Default for Setup {
     }
 }
 
-/// Builds the brick map of `occluders` into `folder`.
+/// Builds the brick map of `occluders`, with the paper's far field, into `folder`.
 pub fn build_map(occluders: &mut [&mut dyn MicrogridStream], folder: &Path) -> Arc<BrickMap> {
+    build_map_with(occluders, FarField::Paper, folder)
+}
+
+/// Builds the brick map of `occluders` into `folder`.
+pub fn build_map_with(
+    occluders: &mut [&mut dyn MicrogridStream],
+    far_field: FarField,
+    folder: &Path,
+) -> Arc<BrickMap> {
     let scratch = tempfile::tempdir().expect("a temporary folder");
     let options = BuildOptions {
         memory_bytes: 256 << 20,
         threads: 2,
         scratch: scratch.path().to_path_buf(),
-        far_field: FarField::Paper,
+        far_field,
     };
     let target = folder.join("map");
     let mut streams: Vec<OccluderStream<'_>> =
@@ -180,6 +202,19 @@ pub fn trace(
     let mut out = vec![0.0; points.len() * shading.coefficients()];
     tracer.trace(&points, &shading, &AtomicBool::new(false), &mut out).expect("the batch traces");
     out.chunks(shading.coefficients()).map(<[f32]>::to_vec).collect()
+}
+
+/// About `count` points on the vertices of a stream, evenly spaced in its order, with its normals.
+pub fn points_of(stream: &mut dyn MicrogridStream, count: usize) -> Vec<(DVec3, Vec3)> {
+    let schema = stream.schema().clone();
+    let normal = schema.attributes.iter().position(|attribute| attribute.name == "N").expect("normals");
+    let (mut grid, mut points) = (Microgrid::default(), Vec::new());
+    stream.rewind().expect("the stream rewinds");
+    while stream.next(&mut grid).expect("the stream reads") {
+        points.extend((0..grid.vertex_count()).map(|v| (grid.position(v), grid.vec3(&schema, normal, v))));
+    }
+    let step = (points.len() / count).max(1);
+    points.into_iter().step_by(step).collect()
 }
 
 /// The folder of real geometry, if it is there; says so if it is not.

@@ -6,12 +6,13 @@ use std::path::Path;
 use engine::brick::intersect::meets;
 use engine::brick::lanes::InstructionSet;
 use engine::brick::leaf::{Face, OPAQUE, extinction_from_opacity};
+use engine::brickmap::FarField;
 use engine::cut::Lod;
 use engine::scene::{Domain, ShOcclusion, Weight};
 use engine::stream::MicrogridStream;
 use engine::stream::adapt::{Instance, MatrixList};
 use glam::{DMat4, DVec3, Vec3};
-use tests::{MemoryStream, Setup, build_map, trace};
+use tests::{MemoryStream, Setup, build_map, build_map_with, trace};
 
 const Y00: f64 = 0.282_094_791_773_878_14;
 const Y10: f64 = 0.488_602_511_902_919_9;
@@ -122,14 +123,8 @@ fn a_line_overhead_hides_its_lune() {
 fn a_closed_room_is_dark() {
     for tilt in [0.0, 0.4] {
         let folder = tempfile::tempdir().unwrap();
-        let turn = glam::DMat3::from_rotation_z(tilt) * glam::DMat3::from_rotation_x(0.7 * tilt);
         let mut room = MemoryStream::new();
-        for axis in 0..3 {
-            let (n, u, v) = (turn.col(axis), turn.col((axis + 1) % 3), turn.col((axis + 2) % 3));
-            for side in [-1.0, 1.0] {
-                room.push_sheet(side * n - u - v, 2.0 * u, 2.0 * v, 31, 1.0);
-            }
-        }
+        let turn = room.push_room(tilt, 31);
         let map = map_of(&mut room, folder.path());
         let points: Vec<_> =
             (0..40).map(|i| (turn * DVec3::new(f64::from(i) * 0.04 - 0.8, 0.3, -0.2), Vec3::ZERO)).collect();
@@ -291,9 +286,12 @@ fn the_same_bits_however_it_is_traced() {
         let center = DVec3::new(f64::from(i % 8), f64::from(i / 8), f64::from(i % 5) * 0.3);
         scene.push_sphere(center, 0.45, 80, if i % 3 == 0 { 0.6 } else { 1.0 });
     }
-    let map = map_of(&mut scene, folder.path());
     let points: Vec<_> = vertices(&scene, Vec3::Z).into_iter().step_by(1009).collect();
-    for lod in [Lod::Off, Lod::Paper, Lod::Footprint { quality: 1.0 }] {
+    let footprint = Lod::Footprint { quality: 1.0 };
+    let cases = [Lod::Off, Lod::Paper, footprint].map(|lod| (FarField::Paper, lod));
+    for (far_field, lod) in cases.into_iter().chain([(FarField::Directional, footprint)]) {
+        let map =
+            build_map_with(&mut [&mut scene], far_field, &folder.path().join(format!("{far_field:?}{lod}")));
         let of =
             |setup: Setup| trace(&map, &points, &ShOcclusion::default(), Some(0), Setup { lod, ..setup });
         let expected = of(Setup::default());

@@ -265,7 +265,6 @@ fn a_wrong_scene_is_refused_with_line_and_column() {
     fails(["build", &scene, "-o", &out], &format!("scene.xml:{line}:"), Some("geometries"));
 
     let scene = desk.write("scene.xml", &xml);
-    fails(["bake", &scene, "-o", &out, "--farfield", "directional"], "not supported yet", Some("paper"));
     let relight = ["relight", &scene, "-o", "a.png", "--scene", &scene, "--camera", "hil"];
     fails(relight, "scene.xml", None);
     assert_eq!(names(desk.0.path()), ["scene.xml"]);

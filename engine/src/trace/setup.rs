@@ -118,9 +118,6 @@ impl Setup {
 /// A batch whose cut is selected, and loaded as far as it fits.
 #[derive(Debug)]
 pub(super) struct Prepared {
-    /// Index of the first point, and points: with the shader enough to know the batch again.
-    key: (u64, usize),
-    shader: ShOcclusion,
     /// The batch.
     pub setup: Setup,
     /// Its cut.
@@ -148,17 +145,7 @@ impl Prepared {
         let mut cut = Cut::default();
         let is_resident = select::select(arena, &setup.bounds, options.lod, setup.solid_angle, &mut cut)?;
         let seconds = start.elapsed().as_secs_f64();
-        let (key, shader) = (Self::key(points), shading.shader.clone());
-        Ok(Self { key, shader, setup, cut, is_resident, seconds })
-    }
-
-    fn key(points: &[Point]) -> (u64, usize) {
-        (points.first().map_or(0, |point| point.index), points.len())
-    }
-
-    /// Whether it is this batch.
-    pub fn is_of(&self, points: &[Point], shading: &Shading) -> bool {
-        self.key == Self::key(points) && self.shader == shading.shader
+        Ok(Self { setup, cut, is_resident, seconds })
     }
 }
 

@@ -20,6 +20,8 @@ pub mod shoot;
 #[cfg(test)]
 mod tests;
 
+use std::str::FromStr;
+
 use serde::{Deserialize, Serialize};
 
 pub use fill::{Others, Root};
@@ -41,6 +43,29 @@ pub enum FarField {
     Paper,
     /// By direction, without leaks: aggregates, plates and must-open marks.
     Directional,
+}
+
+impl FarField {
+    /// `paper` or `directional`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Paper => "paper",
+            Self::Directional => "directional",
+        }
+    }
+}
+
+impl FromStr for FarField {
+    type Err = String;
+
+    /// Reads a [`name`](Self::name).
+    fn from_str(text: &str) -> Result<Self, String> {
+        let kinds = [Self::Paper, Self::Directional];
+        kinds
+            .into_iter()
+            .find(|kind| kind.name() == text)
+            .ok_or_else(|| "expected `paper` or `directional`".into())
+    }
 }
 
 /// The directional far field of a partition's tree: of every node's children, for the decoded boxes of `nodes`, and of its

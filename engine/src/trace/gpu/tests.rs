@@ -159,16 +159,12 @@ impl Grids {
 }
 
 /// A map and points on its surfaces, some without a normal.
-fn scene(folder: &Path) -> (Arc<BrickMap>, Vec<Point>) {
+fn scene(folder: &Path, far_field: FarField) -> (Arc<BrickMap>, Vec<Point>) {
     let jungle = Procedural { kind: ProceduralKind::Jungle, seed: 3, micropolygons: 30_000 };
     let mut jungle = ProceduralStream::new(&jungle, 1.0, UpAxis::Y).unwrap();
     let mut mixed = Grids::mixed();
-    let options = BuildOptions {
-        memory_bytes: 256 << 20,
-        threads: 2,
-        scratch: folder.join("scratch"),
-        far_field: FarField::Paper,
-    };
+    let options =
+        BuildOptions { memory_bytes: 256 << 20, threads: 2, scratch: folder.join("scratch"), far_field };
     std::fs::create_dir_all(&options.scratch).unwrap();
     let mut streams = [OccluderStream { stream: &mut jungle }, OccluderStream { stream: &mut mixed }];
     build(&mut streams, &options, &folder.join("map"), &|_, _| {}, &AtomicBool::new(false)).unwrap();
@@ -215,8 +211,9 @@ fn cpu(map: &Arc<BrickMap>, lod: Lod, arena_bytes: u64) -> SphericalTracer {
     SphericalTracer::new(arena, options, 1.0)
 }
 
-/// A case of the parity tests: level of detail, shader, bytes of a page, steps of a dispatch.
+/// A case of the parity tests: far field, level of detail, shader, bytes of a page, steps of a dispatch.
 struct Case {
+    far_field: FarField,
     lod: Lod,
     shader: ShOcclusion,
     page_bytes: u64,
@@ -224,10 +221,13 @@ struct Case {
 }
 
 fn cases() -> Vec<Case> {
-    let whole = |lod, shader| Case { lod, shader, page_bytes: 1 << 30, steps: 1 << 14 };
+    let far_field = FarField::Directional;
+    let whole = |lod, shader| Case { far_field, lod, shader, page_bytes: 1 << 30, steps: 1 << 14 };
+    let near = Lod::Footprint { quality: 1.0 };
     vec![
         whole(Lod::Off, SHADER),
-        whole(Lod::Footprint { quality: 1.0 }, SHADER),
+        whole(near, SHADER),
+        Case { far_field: FarField::Paper, ..whole(near, SHADER) },
         whole(Lod::Off, ShOcclusion { max_distance: Some(0.4), weight: Weight::Cosine, ..SHADER }),
         Case { page_bytes: 1 << 19, ..whole(Lod::Paper, ShOcclusion { domain: Domain::Sphere, ..SHADER }) },
         Case { steps: 7, ..whole(Lod::Footprint { quality: 2.0 }, ShOcclusion { bands: 6, ..SHADER }) },
@@ -306,7 +306,7 @@ fn traced(tracer: &mut GpuTracer, points: &[Point], next: Option<&[Point]>) -> (
 #[test]
 fn a_cut_larger_than_the_arena_gives_the_same_bits() {
     let folder = tempfile::tempdir().unwrap();
-    let (map, points) = scene(folder.path());
+    let (map, points) = scene(folder.path(), FarField::Directional);
     // The least arena that there can be
     let bytes = (16 * BYTES_MAX as u64).min(map.bytes());
     let Some((mut tracer, expected)) = pair(&map, &points, Lod::Off, bytes, 1) else { return };
@@ -320,7 +320,7 @@ fn a_cut_larger_than_the_arena_gives_the_same_bits() {
 #[test]
 fn devices_share_a_batch_and_look_ahead() {
     let folder = tempfile::tempdir().unwrap();
-    let (map, points) = scene(folder.path());
+    let (map, points) = scene(folder.path(), FarField::Directional);
     let lod = Lod::Footprint { quality: 1.0 };
     let (first, second) = points.split_at(points.len() / 2);
     for gpus in [1, 2] {
@@ -338,7 +338,7 @@ fn devices_share_a_batch_and_look_ahead() {
 #[test]
 fn a_lost_device_is_opened_again_and_then_given_up() {
     let folder = tempfile::tempdir().unwrap();
-    let (map, points) = scene(folder.path());
+    let (map, points) = scene(folder.path(), FarField::Directional);
     let Some((mut tracer, expected)) = pair(&map, &points[..40], Lod::Off, 1 << 28, 1) else { return };
     tracer.gpu().unwrap().destroy();
     let (counts, found) = traced(&mut tracer, &points[..40], None);
@@ -357,7 +357,7 @@ fn a_lost_device_is_opened_again_and_then_given_up() {
 #[test]
 fn a_cancel_ends_a_batch() {
     let folder = tempfile::tempdir().unwrap();
-    let (map, points) = scene(folder.path());
+    let (map, points) = scene(folder.path(), FarField::Directional);
     let Some((mut tracer, _)) = pair(&map, &points[..8], Lod::Off, 1 << 28, 1) else { return };
     let shading = Shading::new(&SHADER, 1, "parity", 0);
     let mut found = vec![0.0; points.len() * shading.coefficients()];
@@ -397,12 +397,14 @@ fn kernels_do_not_depend_on_the_size_of_subgroups() {
 /// coefficients that differ in a single bit.
 #[test]
 fn kernels_meet_what_the_cpu_meets() {
-    let folder = tempfile::tempdir().unwrap();
-    let (map, points) = scene(folder.path());
+    let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let paper = scene(folders[0].path(), FarField::Paper);
+    let directional = scene(folders[1].path(), FarField::Directional);
     let adapter = software();
     let subgroup = adapter.as_ref().and_then(|adapter| adapter.subgroup);
     eprintln!("lanes of a subgroup: {}", subgroup.map_or(0, |[_, largest]| largest));
     for (number, case) in cases().into_iter().enumerate() {
+        let (map, points) = if case.far_field == FarField::Paper { &paper } else { &directional };
         let shading = Shading::new(&case.shader, 1, "parity", 0);
         let samples = case.shader.samples as usize;
         let mut reference = cpu(&map, case.lod, 1 << 28);

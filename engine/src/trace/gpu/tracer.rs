@@ -16,6 +16,7 @@ use super::runner::{Outcome, Run, Runner};
 use crate::batch::Point;
 use crate::cut::Arena;
 use crate::cut::arena::{ArenaCounts, Changes};
+use crate::scene::ShOcclusion;
 use crate::trace::setup::{Prepared, Setup, Shading};
 use crate::trace::stream::{BatchCounts, SphericalTracer, load_waiting};
 use crate::{Error, ErrorKind, Result};
@@ -48,6 +49,28 @@ impl Lane {
     }
 }
 
+/// A batch selected and loaded before its turn.
+#[derive(Debug)]
+struct Ahead {
+    batch: BatchIdentity,
+    prepared: Prepared,
+}
+
+/// Enough to know a batch again: the index of its first point, its points, its shader.
+#[derive(Debug, PartialEq)]
+struct BatchIdentity {
+    first: Option<u64>,
+    points: usize,
+    shader: ShOcclusion,
+}
+
+impl BatchIdentity {
+    fn new(points: &[Point], shading: &Shading) -> Self {
+        let first = points.first().map(|point| point.index);
+        Self { first, points: points.len(), shader: shading.shader.clone() }
+    }
+}
+
 /// The spherical tracer on GPUs.
 #[derive(Debug)]
 pub struct GpuTracer {
@@ -56,7 +79,7 @@ pub struct GpuTracer {
     lanes: Vec<Lane>,
     wide: bool,
     page_bytes_max: u64,
-    prepared: Option<Prepared>,
+    prepared: Option<Ahead>,
     /// Why batches were traced by the CPU or again, the last of each kind.
     pub troubles: Vec<String>,
 }
@@ -188,7 +211,7 @@ impl GpuTracer {
     ) -> Result<Option<BatchCounts>> {
         let start = Instant::now();
         let prepared = match self.prepared.take() {
-            Some(prepared) if prepared.is_of(points, shading) => prepared,
+            Some(ahead) if ahead.batch == BatchIdentity::new(points, shading) => ahead.prepared,
             _ => self.cpu.prepare(points, shading)?,
         };
         let sent_before: u64 = self.lanes.iter().map(|lane| lane.mirror.sent_bytes).sum();
@@ -197,7 +220,12 @@ impl GpuTracer {
         let root = self.cpu.arena_mut().map().root();
         let mut following = None;
         let outcomes = if is_resident {
-            let prepare = || following = next.map(|(points, shading)| self.cpu.prepare(points, shading));
+            let prepare = || {
+                following = next.map(|(points, shading)| {
+                    let batch = BatchIdentity::new(points, shading);
+                    Ok(Ahead { batch, prepared: self.cpu.prepare(points, shading)? })
+                });
+            };
             share(&mut self.lanes, points, shading, &setup, root, cancel, prepare)?
         } else {
             // Rays wait for bricks: one device, since what is loaded for it is not there for others
