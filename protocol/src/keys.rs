@@ -32,6 +32,11 @@ pub fn result_folder(job: &str, pass: i64, fence: i64) -> String {
     format!("jobs/{job}/p{pass}/f{fence}")
 }
 
+/// What a folder in storage holds, written last: a [`FolderIndex`](crate::storage::FolderIndex).
+pub fn index(folder: &str) -> String {
+    format!("{folder}/index.json")
+}
+
 /// A batch's part; the first 16 digits of its hash keep apart what ought to be equal.
 pub fn part(job: &str, pass: i64, batch: i64, fence: i64, sha256: &str) -> String {
     format!("jobs/{job}/p{pass}/b{batch:08}/f{fence}-{}.part", &sha256[..16])

@@ -11,6 +11,7 @@ pub mod keys;
 pub mod limits;
 pub mod problem;
 pub mod states;
+pub mod storage;
 pub mod work;
 
 pub use problem::Problem;

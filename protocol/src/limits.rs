@@ -16,6 +16,12 @@ pub const CLAIM_WAIT_MS_MAX: u64 = 60_000;
 pub const HEARTBEAT_MS: u64 = 10_000;
 /// Milliseconds after which a lease that nobody extends runs out.
 pub const LEASE_TTL_MS: i64 = 60_000;
+/// Milliseconds that a URL of an object holds.
+pub const URL_TTL_MS: u64 = 900_000;
+/// Objects of one request for URLs.
+pub const URLS_MAX: usize = 256;
+/// Files of a folder in storage.
+pub const FOLDER_FILES_MAX: usize = 65_536;
 /// Entries of a page of a list.
 pub const PAGE_MAX: i64 = 1_000;
 /// Bytes of an error's message.
