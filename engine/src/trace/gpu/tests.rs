@@ -407,10 +407,10 @@ fn kernels_meet_what_the_cpu_meets() {
         let (map, points) = if case.far_field == FarField::Paper { &paper } else { &directional };
         let shading = Shading::new(&case.shader, 1, "parity", 0);
         let samples = case.shader.samples as usize;
-        let mut reference = cpu(&map, case.lod, 1 << 28);
-        let [walked, twins] = extinctions(&mut reference, &points, &shading);
+        let mut reference = cpu(map, case.lod, 1 << 28);
+        let [walked, twins] = extinctions(&mut reference, points, &shading);
         let mut expected = vec![0.0; points.len() * shading.coefficients()];
-        reference.trace(&points, &shading, &AtomicBool::new(false), &mut expected).unwrap();
+        reference.trace(points, &shading, &AtomicBool::new(false), &mut expected).unwrap();
         let hits = walked.iter().filter(|&&extinction| extinction > 0).count();
         assert!(
             hits > walked.len() / 10 && hits < walked.len(),
@@ -422,10 +422,10 @@ fn kernels_meet_what_the_cpu_meets() {
         for wide in [false, true] {
             let gpu = Gpu::open(adapter, wide).unwrap();
             let mut tracer =
-                GpuTracer::with_pages(cpu(&map, case.lod, 1 << 28), vec![gpu], case.page_bytes).unwrap();
+                GpuTracer::with_pages(cpu(map, case.lod, 1 << 28), vec![gpu], case.page_bytes).unwrap();
             tracer.runner().unwrap().steps_max = case.steps;
             let mut found = vec![0.0; expected.len()];
-            let counts = tracer.trace(&points, &shading, None, &AtomicBool::new(false), &mut found).unwrap();
+            let counts = tracer.trace(points, &shading, None, &AtomicBool::new(false), &mut found).unwrap();
             assert!(counts.is_device, "{:?}", tracer.troubles);
             let limit = |ray: usize| {
                 let mut bundle = Bundle::new();
