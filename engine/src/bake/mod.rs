@@ -236,7 +236,7 @@ fn run(
 
     // Merge
     let start = Instant::now();
-    set.merge(&plan, &mut log, &scratch, &folder.path().join(format!("{name}.mgs")), control)?;
+    set.merge(&plan, &mut log, false, &scratch, &folder.path().join(format!("{name}.mgs")), control)?;
     report.merge_seconds = start.elapsed().as_secs_f64();
     Ok(report)
 }

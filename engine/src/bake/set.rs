@@ -135,8 +135,8 @@ impl<'a> SetBake<'a> {
         Ok(BatchTracer { plan, shadings, format, backend, points, next: None, next_points, values, row })
     }
 
-    /// Merges parts into the decorated stream `target`, which appears when it is complete. `scratch` is an existing
-    /// folder for temporary data.
+    /// Merges parts into the decorated stream `target`, which appears when it is complete. With `holes`, points may lack
+    /// a result even where all were asked for. `scratch` is an existing folder for temporary data.
     ///
     /// # Errors
     /// See [`merge`].
@@ -144,6 +144,7 @@ impl<'a> SetBake<'a> {
         &self,
         plan: &BatchPlan,
         parts: &mut dyn PartSource,
+        holes: bool,
         scratch: &Path,
         target: &Path,
         control: Control<'_>,
@@ -152,7 +153,7 @@ impl<'a> SetBake<'a> {
         let options = MergeOptions {
             scratch,
             memory_bytes: self.options.memory_bytes / 4,
-            partial: self.options.points_max.is_some(),
+            partial: holes || self.options.points_max.is_some(),
             metadata: &self.metadata(&self.shadings(0)?),
         };
         merge(stream.as_mut(), plan, parts, &options, target, &mut control.stage("merge"))

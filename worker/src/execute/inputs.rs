@@ -1,0 +1,129 @@
+//! A job's scene and its imported streams on this machine.
+//!
+//! ```text
+//! scene/scene.xml, scene/…   as submitted
+//! roots/NAME                 a link to the asset root of that name
+//! import/…, inputs.json      what the import left
+//! ```
+//!
+//! Everything lies below one folder, so what the import recorded holds on any worker, wherever its folder is.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use engine::bake::BakeOptions;
+use engine::bake::inputs::Inputs;
+use engine::bake::set::{SetBake, require_sets};
+use engine::scene::{Roots, Scene, load_confined};
+use protocol::storage::{FolderFile, SceneFiles};
+use protocol::work::PassResult;
+use protocol::{keys, limits};
+
+use super::{Executor, Finished, Work, set_maps};
+use crate::cache::{Entry, Folder};
+use crate::depot::{files_below, read_index, write_folder};
+use crate::{Error, Result, settings};
+
+/// A scene that is imported, and how it is baked.
+pub(super) struct Prepared {
+    pub scene: Scene,
+    pub inputs: Inputs,
+    pub options: BakeOptions,
+    /// Holds the files.
+    _folder: Option<Arc<Folder>>,
+}
+
+impl Executor {
+    /// Imports a job's scene, and says which brick maps its bake sets need.
+    pub(super) fn import(&mut self, work: Work<'_>, folder: &str) -> Result<Finished> {
+        let (root, scratch) = (self.cache.scratch()?, self.cache.scratch()?);
+        let (root, options) = (root.path(), settings::options(&work.claim.task.settings, &self.machine)?);
+        let files = work.depot.scene()?;
+        let entries = scene_entries(&files)?;
+        self.cache.fetch(&entries, work.depot, scratch.path())?;
+        self.cache.link(&entries, root)?;
+        let scene = self.load_scene(root, &files, options_frame(work))?;
+        require_sets(&scene)?;
+        let imported = root.join("import");
+        make(&imported)?;
+        let mut watch = |done: f64| {
+            work.control.progress.update("import", done, "");
+            match work.control.cancel.load(std::sync::atomic::Ordering::Relaxed) {
+                true => Err(engine::Error::new(engine::ErrorKind::Cancelled, "the import was cancelled")),
+                false => Ok(()),
+            }
+        };
+        let inputs = Inputs::prepare(&scene, &imported, options.memory_bytes / 2, &mut watch)?;
+        inputs.save(root)?;
+        let below = files_below(&imported)?;
+        let mut paths: Vec<String> = below.iter().map(|path| format!("import/{path}")).collect();
+        paths.push("inputs.json".into());
+        let prepared = Prepared { scene, inputs, options, _folder: None };
+        let sets = SetBake::all(&prepared.scene, &prepared.inputs, &prepared.options)?;
+        let result = PassResult::Import { sets: set_maps(&sets, &prepared) };
+        let (index, content) = write_folder(work.depot, folder, root, &paths, scratch.path())?;
+        self.keep(root, index.files)?;
+        Ok(Finished { content, result })
+    }
+
+    /// The scene and inputs of a job that is imported.
+    pub(super) fn prepare(&mut self, work: Work<'_>) -> Result<Prepared> {
+        let options = settings::options(&work.claim.task.settings, &self.machine)?;
+        let key = super::need(&work.claim.task.inputs, "inputs")?;
+        let files = work.depot.scene()?;
+        let mut entries = scene_entries(&files)?;
+        let scratch = self.cache.scratch()?;
+        let entry = |(path, file): (String, FolderFile)| Entry {
+            key: format!("{key}/{path}"),
+            path,
+            sha256: file.sha256,
+            bytes: Some(file.bytes),
+        };
+        entries.extend(read_index(work.depot, key, scratch.path())?.files.into_iter().map(entry));
+        let folder = self.folder(key, entries, work.depot)?;
+        let scene = self.load_scene(folder.path(), &files, options_frame(work))?;
+        let inputs = Inputs::load(&scene, folder.path())?;
+        Ok(Prepared { scene, inputs, options, _folder: Some(folder) })
+    }
+
+    /// Puts the scene's text and the roots beside the scene's files below `root`, and reads the scene.
+    fn load_scene(&self, root: &Path, files: &SceneFiles, frame: Option<i64>) -> Result<Scene> {
+        let (path, links) = (root.join("scene").join("scene.xml"), root.join("roots"));
+        make(&root.join("scene"))?;
+        make(&links)?;
+        std::fs::write(&path, &files.scene).map_err(|error| engine::Error::io("write", &path, error))?;
+        let mut roots = Roots::new();
+        for (name, target) in &self.roots {
+            let link = links.join(name);
+            if !link.exists() {
+                std::os::unix::fs::symlink(target, &link).map_err(|e| engine::Error::io("link", &link, e))?;
+            }
+            roots.insert(name.clone(), link);
+        }
+        Ok(load_confined(&path, frame, &roots)?)
+    }
+}
+
+fn options_frame(work: Work<'_>) -> Option<i64> {
+    work.claim.task.settings.frame
+}
+
+/// The files beside a scene as objects.
+fn scene_entries(files: &SceneFiles) -> Result<Vec<Entry>> {
+    if files.files.len() > limits::FILES_MAX {
+        return Err(Error::Damaged(format!("the scene has {} files", files.files.len())));
+    }
+    let mut entries = Vec::with_capacity(files.files.len());
+    for (path, sha256) in &files.files {
+        if !keys::is_relative(path) || path == "scene.xml" || !keys::is_sha256(sha256) {
+            return Err(Error::Damaged(format!("`{path}` cannot be a file beside a scene")));
+        }
+        let (path, key) = (format!("scene/{path}"), keys::asset(sha256));
+        entries.push(Entry { path, key, sha256: sha256.clone(), bytes: None });
+    }
+    Ok(entries)
+}
+
+fn make(path: &Path) -> engine::Result<()> {
+    std::fs::create_dir_all(path).map_err(|error| engine::Error::io("create the folder", path, error))
+}

@@ -1,0 +1,80 @@
+//! The bake pass: batches become parts, one after the other, with one tracer for all claims of a pass.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use engine::bake::set::BatchTracer;
+use engine::bake::work::BakeWork;
+use engine::batch::BatchPlan;
+use engine::brickmap::BrickMap;
+use engine::output::Part;
+use protocol::keys;
+use protocol::work::ClaimedBatch;
+
+use super::{Executor, PartSink, Work, need};
+use crate::Result;
+use crate::cache::{Entry, Folder};
+
+/// What traces the batches of a pass, and what it has loaded.
+pub(super) struct Bench {
+    pass: i64,
+    tracer: BatchTracer,
+    /// The plan's batches by number of the pass's batch.
+    batches: Vec<u32>,
+    /// Holds the files.
+    _folders: [Arc<Folder>; 2],
+    used: Vec<(String, Vec<Entry>)>,
+}
+
+impl Executor {
+    /// Traces the claim's batches, in order, until `sink` has enough.
+    pub(super) fn bake(&mut self, work: Work<'_>, sink: &mut dyn PartSink) -> Result<()> {
+        let mut bench = match self.bench.take() {
+            Some(bench) if bench.pass == work.claim.pass => bench,
+            _ => self.set_up(work)?,
+        };
+        self.used.clone_from(&bench.used);
+        let (mut part, mut bytes) = (Part::default(), Vec::new());
+        let claimed = &work.claim.batches;
+        for (number, &batch) in claimed.iter().enumerate() {
+            let start = Instant::now();
+            bytes.clear();
+            let mut totals = BakeWork::default();
+            if let Some(planned) = bench.planned(batch) {
+                let next = claimed.get(number + 1).and_then(|&next| bench.planned(next));
+                bench.tracer.expect(next)?;
+                bench.tracer.trace(planned, &mut part, &mut totals, work.control.cancel)?;
+                part.encode(bench.tracer.format(), &mut bytes)?;
+            }
+            let rate = totals.rays as f64 / totals.seconds.max(1e-9) / 1e6;
+            let log = format!("traced {} rays in {:.3} s, {rate:.1} M rays/s\n", totals.rays, totals.seconds);
+            work.control.progress.update("trace", (number + 1) as f64 / claimed.len() as f64, "");
+            if !sink.part(batch, &bytes, start.elapsed(), &log)? {
+                break;
+            }
+        }
+        self.bench = Some(bench);
+        Ok(())
+    }
+
+    /// Gets everything that the batches of a pass need.
+    fn set_up(&mut self, work: Work<'_>) -> Result<Bench> {
+        let task = &work.claim.task;
+        let prepared = self.prepare(work)?;
+        let plan_folder = self.fetch_folder(work.depot, need(&task.plan, "plan")?)?;
+        let map_folder = self.fetch_folder(work.depot, &keys::brick_map(need(&task.map, "brick map")?))?;
+        let plan = Arc::new(BatchPlan::open(plan_folder.path())?);
+        let map = Arc::new(BrickMap::open(map_folder.path())?);
+        let set = prepared.set(task)?;
+        let batches = set.batches(&plan);
+        let tracer = set.tracer(plan, map)?;
+        let folders = [plan_folder, map_folder];
+        Ok(Bench { pass: work.claim.pass, tracer, batches, _folders: folders, used: self.used.clone() })
+    }
+}
+
+impl Bench {
+    fn planned(&self, batch: ClaimedBatch) -> Option<u32> {
+        usize::try_from(batch.batch).ok().and_then(|number| self.batches.get(number).copied())
+    }
+}
