@@ -54,6 +54,14 @@ impl Error {
         }
     }
 
+    /// The same failure for another of several things that failed together.
+    pub fn repeated(&self) -> Self {
+        match self {
+            Self::Refused(problem) => Self::Refused(problem.clone()),
+            other => Self::Unreachable(other.to_string()),
+        }
+    }
+
     /// Whether the work was asked to stop.
     pub fn is_cancelled(&self) -> bool {
         matches!(self, Self::Engine(error) if error.kind() == ErrorKind::Cancelled)
