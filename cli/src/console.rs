@@ -25,6 +25,11 @@ impl Answer {
             .map_err(|error| Error::invalid("the answer cannot be written as JSON").caused_by(error))?;
         Ok(Self { json, text: text.into() })
     }
+
+    /// The answer of a command that has said everything already.
+    pub fn said() -> Self {
+        Self { json: String::new(), text: String::new() }
+    }
 }
 
 /// Where a subcommand's progress and answer go.
@@ -53,12 +58,17 @@ impl Console {
         Control { progress: &self.progress, cancel: signals::cancel_flag() }
     }
 
+    /// Prints a part of an answer that comes bit by bit.
+    pub fn print_more(&self, text: &str) -> Result<()> {
+        if text.is_empty() { Ok(()) } else { print(text) }
+    }
+
     /// Prints the answer or the error and says how the process ends.
     pub fn finish(&self, result: Result<Answer>) -> ExitCode {
         self.progress.end(result.is_ok());
         let printed = result.and_then(|answer| {
             let text = if self.json { &answer.json } else { &answer.text };
-            print(text)
+            self.print_more(text)
         });
         match printed {
             Ok(()) => ExitCode::SUCCESS,

@@ -7,6 +7,7 @@ mod console;
 mod demo;
 mod devices;
 mod export;
+mod farm;
 mod figures;
 mod generate;
 mod import;
@@ -57,6 +58,20 @@ enum Command {
     Relight(relight::Arguments),
     Export(export::Arguments),
     Devices(devices::Arguments),
+    Worker(farm::worker::Arguments),
+    Submit(farm::submit::Arguments),
+    Jobs(farm::jobs::Arguments),
+    Watch(farm::watch::Arguments),
+    /// Cancel a job
+    Cancel(farm::control::JobArguments),
+    /// Pause a job: nothing more of it is begun
+    Pause(farm::control::JobArguments),
+    /// Let a paused job go on
+    Resume(farm::control::JobArguments),
+    Retry(farm::control::RetryArguments),
+    Workers(farm::jobs::WorkersArguments),
+    Logs(farm::logs::Arguments),
+    Fetch(farm::fetch::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -78,6 +93,17 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
         Command::Relight(arguments) => relight::run(arguments, console),
         Command::Export(arguments) => export::run(arguments, console),
         Command::Devices(arguments) => devices::run(arguments, console),
+        Command::Worker(arguments) => farm::worker::run(arguments, console),
+        Command::Submit(arguments) => farm::submit::run(arguments, console),
+        Command::Jobs(arguments) => farm::jobs::run(arguments, console),
+        Command::Watch(arguments) => farm::watch::run(arguments, console),
+        Command::Cancel(arguments) => farm::control::run(arguments, "cancel", console),
+        Command::Pause(arguments) => farm::control::run(arguments, "pause", console),
+        Command::Resume(arguments) => farm::control::run(arguments, "resume", console),
+        Command::Retry(arguments) => farm::control::run_retry(arguments, console),
+        Command::Workers(arguments) => farm::jobs::run_workers(arguments, console),
+        Command::Logs(arguments) => farm::logs::run(arguments, console),
+        Command::Fetch(arguments) => farm::fetch::run(arguments, console),
     }
 }
 
