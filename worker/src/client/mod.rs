@@ -3,6 +3,9 @@
 //! A definite answer is any but a server's trouble (5xx, 408, 429) or a connection's. Repetitions wait longer and longer, by
 //! a random share, so that a thousand workers do not come back at once.
 
+#[cfg(test)]
+mod tests;
+
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::Path;
@@ -125,7 +128,7 @@ impl Client {
     ) -> Result<R> {
         let url = self.own(path);
         let bytes = self.repeat(&url.url, |client| {
-            let mut request = client.request(method, &url, wait + ANSWER)?;
+            let mut request = client.request(method, &url);
             for (name, value) in headers {
                 request = request.header(*name, *value);
             }
@@ -151,14 +154,14 @@ impl Client {
         })
     }
 
-    /// GETs an object into the file `path`; its hash. `offset` bytes are left out at its beginning.
+    /// GETs an object into the file `path`; its hash.
     ///
     /// # Errors
     /// As [`get`](Self::get); when the file cannot be written, or the object has more than `bytes_max` bytes.
     pub fn download(&self, url: &ObjectUrl, path: &Path, bytes_max: u64) -> Result<FolderFile> {
         let timeout = transfer_time(bytes_max.min(1 << 32));
         self.repeat(&url.url, |client| {
-            let reply = client.send(client.request("GET", url, timeout)?, (), timeout)?;
+            let reply = client.send(client.request("GET", url), (), timeout)?;
             let mut body = client.judge(reply)?.into_body();
             let announced = body.content_length();
             let content = store(&mut body.with_config().limit(bytes_max).reader(), path)?;
@@ -172,14 +175,14 @@ impl Client {
         })
     }
 
-    /// GETs an object's text from byte `offset` on; nothing where it is not longer.
+    /// GETs a text.
     ///
     /// # Errors
     /// As [`get`](Self::get).
     pub fn text(&self, path: &str) -> Result<String> {
         let url = self.own(path);
         let bytes = self.repeat(&url.url, |client| {
-            let reply = client.send(client.request("GET", &url, ANSWER)?, (), ANSWER)?;
+            let reply = client.send(client.request("GET", &url), (), ANSWER)?;
             client
                 .judge(reply)?
                 .into_body()
@@ -201,8 +204,7 @@ impl Client {
         let timeout = transfer_time(bytes);
         self.repeat(&url.url, |client| {
             let file = open().map_err(Error::from)?;
-            let request =
-                client.request("PUT", url, timeout)?.header("content-type", "application/octet-stream");
+            let request = client.request("PUT", url).header("content-type", "application/octet-stream");
             client.judge(client.send(request, &file, timeout)?).map(drop)
         })
     }
@@ -213,12 +215,7 @@ impl Client {
     }
 
     /// A request to the coordinator, with the token, or to another host, without.
-    fn request(
-        &self,
-        method: &str,
-        url: &ObjectUrl,
-        _timeout: Duration,
-    ) -> Result<ureq::http::request::Builder, Failure> {
+    fn request(&self, method: &str, url: &ObjectUrl) -> ureq::http::request::Builder {
         let is_own = url.url.starts_with('/');
         let uri = if is_own { format!("{}{}", self.base, url.url) } else { url.url.clone() };
         let mut request = Request::builder().method(method).uri(uri);
@@ -228,7 +225,7 @@ impl Client {
         for (name, value) in &url.headers {
             request = request.header(name, value);
         }
-        Ok(request)
+        request
     }
 
     fn send(
