@@ -3,6 +3,7 @@
 //! ```text
 //! lock
 //! objects/ab/abcd…   an object by its SHA-256, never written again
+//! objects/blocks/…   blocks of objects that are too large to be kept whole
 //! folders/NAME/…     hard links to objects: what the engine reads
 //! scratch/N/…        work in progress
 //! ```
@@ -12,7 +13,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -256,19 +257,78 @@ impl Cache {
         Ok(damaged)
     }
 
-    /// Makes room for so many bytes.
+    /// Whether all of these objects are there.
+    pub fn has(&self, files: &BTreeMap<String, FolderFile>) -> bool {
+        files.values().all(|file| self.object(&file.sha256).exists())
+    }
+
+    /// Bytes that the cache may keep.
+    pub fn bytes_max(&self) -> u64 {
+        self.bytes_max
+    }
+
+    /// A block that was kept under `name`, from `offset` on, into `out`; false where it is not there or too short.
+    pub fn read_block(&self, name: &str, offset: u64, out: &mut [u8]) -> bool {
+        let read = |file: File| {
+            file.read_exact_at(out, offset)?;
+            file.set_modified(SystemTime::now())
+        };
+        File::open(self.block(name)).and_then(read).is_ok()
+    }
+
+    /// Keeps a block.
+    ///
+    /// # Errors
+    /// When it does not fit or cannot be written.
+    pub fn keep_block(&self, name: &str, bytes: &[u8]) -> engine::Result<()> {
+        self.make_room(bytes.len() as u64)?;
+        let (path, scratch) = (self.block(name), self.scratch()?);
+        let temporary = scratch.path().join("block");
+        fs::write(&temporary, bytes).map_err(|error| engine::Error::io("write", &temporary, error))?;
+        make_folder(path.parent().unwrap_or(&self.root))?;
+        let known = fs::metadata(&path).map_or(0, |metadata| metadata.len());
+        fs::rename(&temporary, &path).map_err(|error| engine::Error::io("rename to", &path, error))?;
+        let mut state = self.state();
+        state.bytes = (state.bytes + bytes.len() as u64).saturating_sub(known);
+        Ok(())
+    }
+
+    /// Throws away the blocks whose names begin with `prefix`; whether there were any.
+    ///
+    /// # Errors
+    /// When one cannot be removed.
+    pub fn forget_blocks(&self, prefix: &str) -> engine::Result<bool> {
+        let prefix = self.block(prefix);
+        let mut found = objects(&self.root)?;
+        found.retain(|object| {
+            object.path.as_os_str().as_encoded_bytes().starts_with(prefix.as_os_str().as_encoded_bytes())
+        });
+        let mut state = self.state();
+        for object in &found {
+            remove(&object.path)?;
+            state.bytes = state.bytes.saturating_sub(object.bytes);
+        }
+        Ok(!found.is_empty())
+    }
+
+    fn block(&self, name: &str) -> PathBuf {
+        self.root.join("objects").join("blocks").join(name)
+    }
+
+    /// Makes room for so many bytes, and some more: finding what can go takes time.
     fn make_room(&self, bytes: u64) -> engine::Result<()> {
         let mut state = self.state();
         if state.bytes + bytes <= self.bytes_max {
             return Ok(());
         }
+        let ample = self.bytes_max - self.bytes_max / 16;
         // Objects that no folder links to first, then folders one by one
         loop {
             let mut free: Vec<Object> = objects(&self.root)?;
             free.retain(|object| object.links == 1);
             free.sort_by(|a, b| (a.used, &a.path).cmp(&(b.used, &b.path)));
             for object in free {
-                if state.bytes + bytes <= self.bytes_max {
+                if state.bytes + bytes <= ample {
                     return Ok(());
                 }
                 remove(&object.path)?;

@@ -1,5 +1,6 @@
 //! Where the bytes of a lease come from and go to.
 
+use std::fmt::Debug;
 use std::path::{Path, PathBuf};
 
 use protocol::storage::{FolderFile, FolderIndex, SceneFiles};
@@ -20,7 +21,7 @@ pub struct Wanted {
 }
 
 /// The bytes that a lease may reach.
-pub trait Depot: Sync {
+pub trait Depot: Debug + Send + Sync {
     /// The scene as it was submitted.
     ///
     /// # Errors
@@ -29,6 +30,12 @@ pub trait Depot: Sync {
 
     /// Reads objects; one answer for each, with the hash of what came.
     fn read(&self, wanted: &[Wanted]) -> Vec<Result<FolderFile>>;
+
+    /// Fills `out` with an object's bytes from `offset` on.
+    ///
+    /// # Errors
+    /// When they cannot be had.
+    fn read_range(&self, key: &str, offset: u64, out: &mut [u8]) -> Result<()>;
 
     /// Writes a file as an object.
     ///

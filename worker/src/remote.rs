@@ -76,6 +76,11 @@ impl Depot for LeaseDepot {
         wanted.chunks(URLS_MAX).flat_map(|wanted| self.read_some(wanted)).collect()
     }
 
+    fn read_range(&self, key: &str, offset: u64, out: &mut [u8]) -> Result<()> {
+        let urls = self.urls(vec![ObjectRequest::Get { key: key.into() }])?;
+        self.client.download_range(&urls[0], offset, out)
+    }
+
     fn write(&self, key: &str, path: &Path, content: &FolderFile) -> Result<()> {
         let FolderFile { sha256, bytes } = content.clone();
         let urls = self.urls(vec![ObjectRequest::Put { key: key.into(), sha256, bytes }])?;

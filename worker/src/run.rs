@@ -15,6 +15,7 @@ use crate::cache::Cache;
 use crate::claims::{Claimed, Claims, release};
 use crate::client::{Client, jitter};
 use crate::deliver::{deliver, failed, report};
+use crate::depot::Depot;
 use crate::execute::{Executor, PartSink, Work};
 use crate::heartbeat::Pulse;
 use crate::remote::LeaseDepot;
@@ -198,7 +199,8 @@ impl Desk<'_> {
         tracing::info!(job = claim.task.job, pass = claim.pass, kind = %claim.task.kind, batches = claim.batches.len(), "claimed");
         self.summary.claims += 1;
         let client = self.options.client.with_patience(PATIENCE);
-        let depot = LeaseDepot { client, session: self.pulse.session.clone(), lease: lease.id.clone() };
+        let (session, id) = (self.pulse.session.clone(), lease.id.clone());
+        let depot: Arc<dyn Depot> = Arc::new(LeaseDepot { client, session, lease: id });
         let control = Control { progress: &**lease, cancel: &lease.cancel };
         let work = Work { claim, depot: &depot, control };
         let mut sink =

@@ -9,9 +9,11 @@
 //! Offsets count through all segments as if each had its full size. The folder appears under its name when it is
 //! complete. Every brick has its own checksum, the directory's is in the manifest.
 
+use std::fmt::Debug;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use glam::{I64Vec3, IVec3};
 use serde::{Deserialize, Serialize};
@@ -75,13 +77,28 @@ pub(super) fn segment_name(number: u64) -> String {
     format!("segment.{number:04}")
 }
 
+/// Where segments are read from that do not lie beside their map's manifest.
+pub trait SegmentSource: Debug + Send + Sync {
+    /// Fills `out` with the bytes of the segment called `name` from `offset` on.
+    ///
+    /// # Errors
+    /// When they cannot be had.
+    fn read(&self, name: &str, offset: u64, out: &mut [u8]) -> Result<()>;
+}
+
 /// An open brick map.
 #[derive(Debug)]
 pub struct BrickMap {
     path: PathBuf,
     manifest: Manifest,
     directory: Vec<u64>,
-    segments: Vec<File>,
+    segments: Segments,
+}
+
+#[derive(Debug)]
+enum Segments {
+    Files(Vec<File>),
+    Elsewhere(Arc<dyn SegmentSource>),
 }
 
 impl BrickMap {
@@ -90,6 +107,21 @@ impl BrickMap {
     /// # Errors
     /// When it is not there, of another version, or damaged.
     pub fn open(path: &Path) -> Result<Self> {
+        let (mut map, bytes) = Self::open_directory(path, Segments::Files(Vec::new()))?;
+        map.segments = Segments::Files(map.open_segments(bytes)?);
+        Ok(map)
+    }
+
+    /// Opens the map whose manifest and directory are in a folder, and whose segments come from `source`.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    pub fn open_with(path: &Path, source: Arc<dyn SegmentSource>) -> Result<Self> {
+        Ok(Self::open_directory(path, Segments::Elsewhere(source))?.0)
+    }
+
+    /// Reads and checks manifest and directory; the map and the bytes of all segments.
+    fn open_directory(path: &Path, segments: Segments) -> Result<(Self, u64)> {
         let manifest = read_manifest(&path.join("manifest.json"))?;
         let directory_path = path.join("directory");
         let expected = 8 * u64::from(manifest.bricks);
@@ -112,13 +144,13 @@ impl BrickMap {
             .chunks_exact(8)
             .map(|entry| u64::from_le_bytes(entry.try_into().expect("8 bytes")))
             .collect();
-        let mut map = Self { path: path.to_path_buf(), manifest, directory, segments: Vec::new() };
-        map.open_segments()?;
-        Ok(map)
+        let map = Self { path: path.to_path_buf(), manifest, directory, segments };
+        let end = map.check_directory()?;
+        Ok((map, end))
     }
 
-    /// Opens the segments and checks that bricks lie in them in order.
-    fn open_segments(&mut self) -> Result<()> {
+    /// Checks that bricks lie in the segments in order; where the last one ends.
+    fn check_directory(&self) -> Result<u64> {
         let mut end = 0;
         for (brick, &entry) in self.directory.iter().enumerate() {
             let (offset, length) = place(entry);
@@ -132,6 +164,12 @@ impl BrickMap {
             }
             end = offset + length;
         }
+        Ok(end)
+    }
+
+    /// Opens the segments' files, which end at `end`.
+    fn open_segments(&self, end: u64) -> Result<Vec<File>> {
+        let mut segments = Vec::new();
         for number in 0..end.div_ceil(SEGMENT_BYTES) {
             let path = self.path.join(segment_name(number));
             let file = File::open(&path).map_err(|e| Error::io("open", &path, e))?;
@@ -148,9 +186,9 @@ impl BrickMap {
                 )
                 .hint("build the brick map again"));
             }
-            self.segments.push(file);
+            segments.push(file);
         }
-        Ok(())
+        Ok(segments)
     }
 
     /// The folder.
@@ -224,9 +262,13 @@ impl BrickMap {
                 bytes += place(self.directory[brick]).1 as usize;
                 brick += 1;
             }
-            self.segments[segment as usize]
-                .read_exact_at(&mut out[at..at + bytes], offset % SEGMENT_BYTES)
-                .map_err(|e| Error::io("read", self.path.join(segment_name(segment)), e))?;
+            let (out, offset) = (&mut out[at..at + bytes], offset % SEGMENT_BYTES);
+            match &self.segments {
+                Segments::Files(files) => files[segment as usize]
+                    .read_exact_at(out, offset)
+                    .map_err(|e| Error::io("read", self.path.join(segment_name(segment)), e))?,
+                Segments::Elsewhere(source) => source.read(&segment_name(segment), offset, out)?,
+            }
             at += bytes;
         }
         Ok(())

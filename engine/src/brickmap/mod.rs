@@ -36,7 +36,7 @@ use std::time::Instant;
 
 use census::Census;
 pub use farfield::FarField;
-pub use file::{BrickMap, FORMAT_VERSION, Manifest};
+pub use file::{BrickMap, FORMAT_VERSION, Manifest, SegmentSource};
 use log::Spill;
 use output::Output;
 use pack::{ByteSplit, Primitive};

@@ -175,6 +175,29 @@ impl Client {
         })
     }
 
+    /// GETs a range of an object: as many bytes from `offset` on as `out` has room for.
+    ///
+    /// # Errors
+    /// As [`get`](Self::get).
+    pub fn download_range(&self, url: &ObjectUrl, offset: u64, out: &mut [u8]) -> Result<()> {
+        let timeout = transfer_time(out.len() as u64);
+        let range = format!("bytes={offset}-{}", offset + out.len() as u64 - 1);
+        self.repeat(&url.url, |client| {
+            let request = client.request("GET", url).header("range", &range);
+            let mut reply = client.judge(client.send(request, (), timeout)?)?;
+            if reply.status().as_u16() != 206 {
+                return Err(Failure::End(Error::Unreachable("the storage does not know ranges".into())));
+            }
+            let broke_off = |error: std::io::Error| {
+                Failure::Trouble(Trouble {
+                    message: format!("the transfer broke off: {error}"),
+                    retry_after: None,
+                })
+            };
+            reply.body_mut().as_reader().read_exact(out).map_err(broke_off)
+        })
+    }
+
     /// GETs a text.
     ///
     /// # Errors

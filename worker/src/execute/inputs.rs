@@ -15,7 +15,7 @@ use engine::bake::BakeOptions;
 use engine::bake::inputs::Inputs;
 use engine::bake::set::{SetBake, require_sets};
 use engine::scene::{Roots, Scene, load_confined};
-use protocol::storage::{FolderFile, SceneFiles};
+use protocol::storage::SceneFiles;
 use protocol::work::PassResult;
 use protocol::{keys, limits};
 
@@ -40,7 +40,7 @@ impl Executor {
         let (root, options) = (root.path(), settings::options(&work.claim.task.settings, &self.machine)?);
         let files = work.depot.scene()?;
         let entries = scene_entries(&files)?;
-        self.cache.fetch(&entries, work.depot, scratch.path())?;
+        self.cache.fetch(&entries, &**work.depot, scratch.path())?;
         self.cache.link(&entries, root)?;
         let scene = self.load_scene(root, &files, options_frame(work))?;
         require_sets(&scene)?;
@@ -61,7 +61,7 @@ impl Executor {
         let prepared = Prepared { scene, inputs, options, _folder: None };
         let sets = SetBake::all(&prepared.scene, &prepared.inputs, &prepared.options)?;
         let result = PassResult::Import { sets: set_maps(&sets, &prepared) };
-        let (index, content) = write_folder(work.depot, folder, root, &paths, scratch.path())?;
+        let (index, content) = write_folder(&**work.depot, folder, root, &paths, scratch.path())?;
         self.keep(root, index.files)?;
         Ok(Finished { content, result })
     }
@@ -73,14 +73,8 @@ impl Executor {
         let files = work.depot.scene()?;
         let mut entries = scene_entries(&files)?;
         let scratch = self.cache.scratch()?;
-        let entry = |(path, file): (String, FolderFile)| Entry {
-            key: format!("{key}/{path}"),
-            path,
-            sha256: file.sha256,
-            bytes: Some(file.bytes),
-        };
-        entries.extend(read_index(work.depot, key, scratch.path())?.files.into_iter().map(entry));
-        let folder = self.folder(key, entries, work.depot)?;
+        entries.extend(super::entries(key, &read_index(&**work.depot, key, scratch.path())?));
+        let folder = self.folder(key, entries, &**work.depot)?;
         let scene = self.load_scene(folder.path(), &files, options_frame(work))?;
         let inputs = Inputs::load(&scene, folder.path())?;
         Ok(Prepared { scene, inputs, options, _folder: Some(folder) })

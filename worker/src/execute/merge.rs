@@ -21,13 +21,13 @@ impl Executor {
     pub(super) fn merge(&mut self, work: Work<'_>, folder: &str) -> Result<Finished> {
         let task = &work.claim.task;
         let prepared = self.prepare(work)?;
-        let plan_folder = self.fetch_folder(work.depot, need(&task.plan, "plan")?)?;
+        let plan_folder = self.fetch_folder(&**work.depot, need(&task.plan, "plan")?)?;
         let plan = BatchPlan::open(plan_folder.path())?;
         let set = prepared.set(task)?;
         let pass = task.parts.ok_or_else(|| engine::Error::invalid("the task names no parts"))?;
         let scratch = self.cache.scratch()?;
         let mut parts = CommittedParts {
-            depot: work.depot,
+            depot: &**work.depot,
             job: &task.job,
             pass,
             format: set.format(&plan)?,

@@ -1,5 +1,6 @@
 //! A claim, executed: the steps of a bake, taken one by one with the functions that `pantaray bake` calls in a row.
 
+mod bricks;
 mod inputs;
 mod merge;
 #[cfg(test)]
@@ -15,7 +16,7 @@ use engine::bake::{BakeOptions, Control};
 use engine::brickmap::BrickMap;
 use engine::scene::Roots;
 use engine::{ErrorKind, bake::set::SetBake};
-use protocol::storage::FolderFile;
+use protocol::storage::{FolderFile, FolderIndex};
 use protocol::work::{Claim, ClaimedBatch, PassResult, SetMap, Task};
 use protocol::{PassKind, keys};
 
@@ -31,12 +32,16 @@ const HEALINGS_MAX: usize = 3;
 /// Takes the step that a claim asks for; keeps what the next claim of the same pass will need.
 pub struct Executor {
     cache: Arc<Cache>,
+    /// Bytes of a brick map that is kept whole at most.
+    whole_map_bytes_max: u64,
     machine: BakeOptions,
     roots: Roots,
     /// What traces batches, while claims are of the same pass.
     bench: Option<Bench>,
     /// The folders that this claim has read from.
     used: Vec<(String, Vec<Entry>)>,
+    /// What the names of the blocks that it has read from begin with.
+    blocks: Option<String>,
 }
 
 /// A claim and what it is executed with.
@@ -45,7 +50,7 @@ pub struct Work<'a> {
     /// The claim.
     pub claim: &'a Claim,
     /// Its bytes.
-    pub depot: &'a dyn Depot,
+    pub depot: &'a Arc<dyn Depot>,
     /// Progress, and the flag that ends it.
     pub control: Control<'a>,
 }
@@ -71,7 +76,8 @@ pub trait PartSink {
 impl Executor {
     /// An executor that works with what `machine` says of this machine and reads below `roots`.
     pub fn new(cache: Arc<Cache>, machine: BakeOptions, roots: Roots) -> Self {
-        Self { cache, machine, roots, bench: None, used: Vec::new() }
+        let whole_map_bytes_max = cache.bytes_max() / bricks::WHOLE_SHARE;
+        Self { cache, whole_map_bytes_max, machine, roots, bench: None, used: Vec::new(), blocks: None }
     }
 
     /// Executes a claim: parts go to `sink`, the result of a pass of one batch comes back.
@@ -81,6 +87,7 @@ impl Executor {
     pub fn execute(&mut self, work: Work<'_>, sink: &mut dyn PartSink) -> Result<Option<Finished>> {
         for _ in 0..HEALINGS_MAX {
             self.used.clear();
+            self.blocks = None;
             match self.guarded(work, sink) {
                 Err(Error::Engine(error)) if error.kind() != ErrorKind::Cancelled && self.heal()? => {
                     tracing::warn!("files of the local disk were damaged and are fetched again: {error}");
@@ -94,7 +101,10 @@ impl Executor {
     /// Throws away what of the local disk is damaged; whether anything was.
     fn heal(&mut self) -> Result<bool> {
         self.bench = None;
-        let mut damaged = false;
+        let mut damaged = match self.blocks.take() {
+            Some(prefix) => self.cache.forget_blocks(&prefix)?,
+            None => false,
+        };
         for (name, entries) in &self.used {
             damaged |= self.cache.check(name, entries)?;
         }
@@ -157,7 +167,7 @@ impl Executor {
         };
         let paths = crate::depot::files_below(&target)?;
         let folder = keys::brick_map(key);
-        let (index, content) = write_folder(work.depot, &folder, &target, &paths, scratch.path())?;
+        let (index, content) = write_folder(&**work.depot, &folder, &target, &paths, scratch.path())?;
         self.keep(&target, index.files)?;
         Ok(Finished { content, result })
     }
@@ -172,7 +182,7 @@ impl Executor {
         let points = batches.iter().map(|&batch| u64::from(plan.batch(batch as usize).count)).sum();
         let result = PassResult::Plan { batches: batches.len() as i64, points };
         let paths = crate::depot::files_below(target.path())?;
-        let (index, content) = write_folder(work.depot, folder, target.path(), &paths, scratch.path())?;
+        let (index, content) = write_folder(&**work.depot, folder, target.path(), &paths, scratch.path())?;
         self.keep(target.path(), index.files)?;
         Ok(Finished { content, result })
     }
@@ -196,13 +206,7 @@ impl Executor {
     fn fetch_folder(&mut self, depot: &dyn Depot, key: &str) -> Result<Arc<Folder>> {
         let scratch = self.cache.scratch()?;
         let index = read_index(depot, key, scratch.path())?;
-        let entry = |(path, file): (&String, &FolderFile)| Entry {
-            path: path.clone(),
-            key: format!("{key}/{path}"),
-            sha256: file.sha256.clone(),
-            bytes: Some(file.bytes),
-        };
-        self.folder(key, index.files.iter().map(entry).collect(), depot)
+        self.folder(key, entries(key, &index), depot)
     }
 
     /// A folder of the cache, remembered as used.
@@ -212,6 +216,17 @@ impl Executor {
         self.used.push((name, entries));
         Ok(folder)
     }
+}
+
+/// The files of the folder `key` in storage as objects.
+fn entries(key: &str, index: &FolderIndex) -> Vec<Entry> {
+    let entry = |(path, file): (&String, &FolderFile)| Entry {
+        path: path.clone(),
+        key: format!("{key}/{path}"),
+        sha256: file.sha256.clone(),
+        bytes: Some(file.bytes),
+    };
+    index.files.iter().map(entry).collect()
 }
 
 /// What a task must name.

@@ -6,11 +6,10 @@ use std::time::Instant;
 use engine::bake::set::BatchTracer;
 use engine::bake::work::BakeWork;
 use engine::batch::BatchPlan;
-use engine::brickmap::BrickMap;
 use engine::output::Part;
-use protocol::keys;
 use protocol::work::ClaimedBatch;
 
+use super::bricks::RemoteBricks;
 use super::{Executor, PartSink, Work, need};
 use crate::Result;
 use crate::cache::{Entry, Folder};
@@ -21,6 +20,8 @@ pub(super) struct Bench {
     tracer: BatchTracer,
     /// The plan's batches by number of the pass's batch.
     batches: Vec<u32>,
+    /// Where bricks come from that are not all on the local disk.
+    bricks: Option<Arc<RemoteBricks>>,
     /// Holds the files.
     _folders: [Arc<Folder>; 2],
     used: Vec<(String, Vec<Entry>)>,
@@ -34,6 +35,10 @@ impl Executor {
             _ => self.set_up(work)?,
         };
         self.used.clone_from(&bench.used);
+        if let Some(bricks) = &bench.bricks {
+            bricks.ask(work.depot);
+            self.blocks = Some(bricks.prefix().into());
+        }
         let (mut part, mut bytes) = (Part::default(), Vec::new());
         let claimed = &work.claim.batches;
         for (number, &batch) in claimed.iter().enumerate() {
@@ -61,15 +66,16 @@ impl Executor {
     fn set_up(&mut self, work: Work<'_>) -> Result<Bench> {
         let task = &work.claim.task;
         let prepared = self.prepare(work)?;
-        let plan_folder = self.fetch_folder(work.depot, need(&task.plan, "plan")?)?;
-        let map_folder = self.fetch_folder(work.depot, &keys::brick_map(need(&task.map, "brick map")?))?;
+        let plan_folder = self.fetch_folder(&**work.depot, need(&task.plan, "plan")?)?;
         let plan = Arc::new(BatchPlan::open(plan_folder.path())?);
-        let map = Arc::new(BrickMap::open(map_folder.path())?);
+        let (map, map_folder, bricks) = self.map(work.depot, need(&task.map, "brick map")?)?;
+        let map = Arc::new(map);
         let set = prepared.set(task)?;
         let batches = set.batches(&plan);
         let tracer = set.tracer(plan, map)?;
         let folders = [plan_folder, map_folder];
-        Ok(Bench { pass: work.claim.pass, tracer, batches, _folders: folders, used: self.used.clone() })
+        let (pass, used) = (work.claim.pass, self.used.clone());
+        Ok(Bench { pass, tracer, batches, bricks, _folders: folders, used })
     }
 }
 
