@@ -6,6 +6,7 @@
 //! *fence* is a number per batch that rises at every claim: results under an older fence are refused.
 
 pub mod admin;
+pub mod events;
 pub mod job;
 pub mod keys;
 pub mod limits;

@@ -1,11 +1,13 @@
 //! Bounds that both sides keep: what they protect is said with each.
 
 /// Bytes of a JSON request.
-pub const REQUEST_BYTES_MAX: usize = 4 << 20;
+pub const REQUEST_BYTES_MAX: usize = 16 << 20;
 /// Bytes of one uploaded asset.
 pub const ASSET_BYTES_MAX: u64 = 1 << 40;
 /// Files of one job.
 pub const FILES_MAX: usize = 65_536;
+/// Frames of one submission.
+pub const FRAMES_MAX: i64 = 4_096;
 /// Batches of one pass.
 pub const BATCHES_MAX: i64 = 16 << 20;
 /// Batches of one claim.

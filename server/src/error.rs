@@ -18,12 +18,16 @@ pub enum Kind {
     Forbidden,
     /// What was named is not there, or not for this token.
     NotFound,
+    /// The operation has no such method.
+    Method,
     /// It contradicts what is there.
     Conflict,
     /// The session or lease is over.
     Gone,
     /// A stated limit was reached.
     TooLarge,
+    /// The object has no such range of bytes.
+    Range,
     /// Too many requests of this sort.
     TooMany,
     /// Not now: try again.
@@ -71,9 +75,11 @@ impl Error {
             Kind::Unauthorized => (StatusCode::UNAUTHORIZED, "unauthorized", "A token is needed"),
             Kind::Forbidden => (StatusCode::FORBIDDEN, "forbidden", "The token may not do this"),
             Kind::NotFound => (StatusCode::NOT_FOUND, "not_found", "Not there"),
+            Kind::Method => (StatusCode::METHOD_NOT_ALLOWED, "method", "No such method"),
             Kind::Conflict => (StatusCode::CONFLICT, "conflict", "The state does not allow this"),
             Kind::Gone => (StatusCode::GONE, "gone", "It is over"),
             Kind::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "too_large", "A limit was reached"),
+            Kind::Range => (StatusCode::RANGE_NOT_SATISFIABLE, "range", "No such range"),
             Kind::TooMany => (StatusCode::TOO_MANY_REQUESTS, "too_many", "Too many requests"),
             Kind::Unavailable => (StatusCode::SERVICE_UNAVAILABLE, "unavailable", "Not now"),
             Kind::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "internal", "The coordinator failed"),
@@ -143,6 +149,13 @@ impl From<std::io::Error> for Error {
     fn from(error: std::io::Error) -> Self {
         tracing::error!(%error, "storage");
         Self::new(Kind::Internal, "storage refused")
+    }
+}
+
+impl From<object_store::Error> for Error {
+    fn from(error: object_store::Error) -> Self {
+        tracing::error!(%error, "storage");
+        Self::new(Kind::Unavailable, "storage is away")
     }
 }
 

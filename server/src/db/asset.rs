@@ -24,6 +24,24 @@ impl Store {
         Ok(missing)
     }
 
+    /// The bytes of assets of a project, all together.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn asset_bytes(&self, project: &str, hashes: &[String]) -> Result<i64> {
+        let mut bytes = 0;
+        for chunk in hashes.chunks(500) {
+            let list = super::placeholders(2, chunk.len());
+            let sql = format!(
+                "SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM asset WHERE project = $1 AND sha256 IN ({list})"
+            );
+            let mut values = values![project];
+            values.extend(chunk.iter().map(Into::into));
+            bytes += self.query_one(sql, values).await?.map_or(Ok(0), |row| row.int(0))?;
+        }
+        Ok(bytes)
+    }
+
     /// Notes that the project has uploaded an asset.
     ///
     /// # Errors

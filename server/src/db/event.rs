@@ -1,29 +1,9 @@
 //! What happened, for dashboards and scripts: transitions of jobs and workers, in the order of their commits.
 
-use serde::Serialize;
-use utoipa::ToSchema;
+use protocol::events::Event;
 
 use super::{Store, Tx};
 use crate::{Result, values};
-
-/// Something that happened.
-#[derive(Clone, Debug, Serialize, ToSchema)]
-pub struct Event {
-    /// Its number; later events have greater ones.
-    pub id: i64,
-    /// When.
-    pub at: i64,
-    /// What: `job.submitted`, `job.running`, `job.succeeded`, …
-    pub kind: String,
-    /// In which project.
-    pub project: String,
-    /// To which job.
-    pub job: Option<String>,
-    /// By whom.
-    pub actor: String,
-    /// Why, or to what.
-    pub detail: String,
-}
 
 /// An event to be.
 pub(super) struct NewEvent<'a> {

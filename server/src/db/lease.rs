@@ -11,7 +11,33 @@ use crate::{Result, values};
 /// Leases that end in one round at most; the next round follows at once.
 const EXPIRE_MAX: i64 = 200;
 
+/// What a live lease is of.
+#[derive(Clone, Debug)]
+pub struct Held {
+    /// The pass.
+    pub pass: i64,
+    /// The job.
+    pub job: String,
+    /// The batches that are still to be reported.
+    pub batches: Vec<ClaimedBatch>,
+}
+
 impl Store {
+    /// What a live lease of a session is of; none where it is over, or another's.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn held(&self, lease: &str, session: &str) -> Result<Option<Held>> {
+        let sql = "SELECT l.pass_id, p.job_id FROM lease l JOIN pass p ON p.id = l.pass_id
+            WHERE l.id = $1 AND l.session = $2";
+        let Some(row) = self.query_one(sql, values![lease, session]).await? else { return Ok(None) };
+        let sql = "SELECT seq, fence FROM batch WHERE lease_id = $1 AND state = 1 ORDER BY seq";
+        let rows = self.query(sql, values![lease]).await?;
+        let batch = |row: &super::Row| Ok(ClaimedBatch { batch: row.int(0)?, fence: row.int(1)? });
+        let batches = rows.iter().map(batch).collect::<Result<_>>()?;
+        Ok(Some(Held { pass: row.int(0)?, job: row.text(1)?, batches }))
+    }
+
     /// Extends leases of a session and says which are over: run out, or of a job that was cancelled.
     ///
     /// # Errors
