@@ -14,6 +14,7 @@ mod import;
 mod inspect;
 mod progress;
 mod relight;
+mod service;
 mod signals;
 mod streams;
 mod values;
@@ -72,6 +73,10 @@ enum Command {
     Workers(farm::jobs::WorkersArguments),
     Logs(farm::logs::Arguments),
     Fetch(farm::fetch::Arguments),
+    Serve(service::serve::Arguments),
+    /// Make, list and revoke tokens
+    #[command(subcommand)]
+    Token(service::token::Command),
 }
 
 fn main() -> ExitCode {
@@ -104,6 +109,8 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
         Command::Workers(arguments) => farm::jobs::run_workers(arguments, console),
         Command::Logs(arguments) => farm::logs::run(arguments, console),
         Command::Fetch(arguments) => farm::fetch::run(arguments, console),
+        Command::Serve(arguments) => service::serve::run(arguments),
+        Command::Token(command) => service::token::run(command),
     }
 }
 

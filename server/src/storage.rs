@@ -86,7 +86,8 @@ impl Storage {
         let bucket = place.split("://").nth(1).unwrap_or_default();
         if bucket.trim_end_matches('/').contains('/') {
             // A signer knows the bucket only: keys begin at its root
-            return Err(Error::invalid(format!("`{place}` names more than a bucket")).hint("give it a bucket of its own"));
+            return Err(Error::invalid(format!("`{place}` names more than a bucket"))
+                .hint("give it a bucket of its own"));
         }
         match place.split("://").next().unwrap_or_default() {
             "s3" | "s3a" => Ok(Self::signing(AmazonS3Builder::from_env().with_url(place).build()?)),
@@ -94,7 +95,10 @@ impl Storage {
             "az" | "azure" | "abfs" | "abfss" => {
                 Ok(Self::signing(MicrosoftAzureBuilder::from_env().with_url(place).build()?))
             }
-            other => Err(Error::invalid(format!("`{other}` is no storage that is known")).hint("`s3`, `gs` or `az`")),
+            other => {
+                Err(Error::invalid(format!("`{other}` is no storage that is known"))
+                    .hint("`s3`, `gs` or `az`"))
+            }
         }
     }
 
@@ -267,7 +271,11 @@ mod tests {
     async fn an_upload_appears_only_if_it_is_what_was_announced() {
         let folder = tempfile::tempdir().unwrap();
         let storage = Storage::open(folder.path().to_str().unwrap()).unwrap();
-        let cases = [(expected("ab", Some(2)), true), (expected("ab", Some(3)), false), (expected("xy", None), false)];
+        let cases = [
+            (expected("ab", Some(2)), true),
+            (expected("ab", Some(3)), false),
+            (expected("xy", None), false),
+        ];
         for (number, ((sha256, bytes), good)) in cases.into_iter().enumerate() {
             let key = format!("a/{number}");
             let expected = Expected { sha256: &sha256, bytes, bytes_max: 100 };

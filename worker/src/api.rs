@@ -2,7 +2,9 @@
 
 use std::time::Duration;
 
-use protocol::admin::{EnrolRequest, MissingReply, MissingRequest, Secret, WorkerDetail};
+use protocol::admin::{
+    EnrolRequest, MissingReply, MissingRequest, Secret, TokenDetail, TokenRequest, WorkerDetail,
+};
 use protocol::job::{
     BatchSelection, Changed, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary, Manifest,
     Submitted,
@@ -123,5 +125,24 @@ impl Client {
     /// The farm's workers.
     pub fn workers(&self) -> Result<Vec<WorkerDetail>> {
         self.get("/v1/workers")
+    }
+}
+
+/// What administrators ask. Errors are those of [`Client::get`].
+#[expect(clippy::missing_errors_doc, reason = "said once, above")]
+impl Client {
+    /// Makes a token.
+    pub fn create_token(&self, request: &TokenRequest) -> Result<Secret> {
+        self.post("/v1/tokens", request, Duration::ZERO)
+    }
+
+    /// All tokens, latest first.
+    pub fn tokens(&self) -> Result<Vec<TokenDetail>> {
+        self.get("/v1/tokens")
+    }
+
+    /// Revokes a token.
+    pub fn revoke_token(&self, id: &str) -> Result<Value> {
+        self.post(&format!("/v1/tokens/{id}/revoke"), &json!({}), Duration::ZERO)
     }
 }

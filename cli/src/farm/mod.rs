@@ -55,7 +55,7 @@ fn read_token(path: &Path) -> Result<String> {
 }
 
 /// `NAME=VALUE`.
-fn pair(text: &str) -> Result<(String, PathBuf), String> {
+pub fn pair(text: &str) -> Result<(String, PathBuf), String> {
     match text.split_once('=') {
         Some((name, value)) if !name.is_empty() && !value.is_empty() => Ok((name.into(), value.into())),
         _ => Err("expected NAME=DIR".into()),

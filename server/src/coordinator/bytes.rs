@@ -145,7 +145,8 @@ impl Coordinator {
     /// [`Kind::Gone`] when the lease is over, [`Kind::Conflict`] where its task merges nothing.
     pub async fn lease_parts(&self, holder: Holder<'_>, after: Option<i64>) -> Result<PartPage> {
         let (_, task) = self.held(holder).await?;
-        let parts = task.parts.ok_or_else(|| Error::new(Kind::Conflict, "the lease's task merges nothing"))?;
+        let parts =
+            task.parts.ok_or_else(|| Error::new(Kind::Conflict, "the lease's task merges nothing"))?;
         self.store.parts(parts, after.unwrap_or(-1), PARTS_PAGE).await
     }
 

@@ -63,10 +63,18 @@ impl Coordinator {
 fn check_words(request: &JobRequest) -> Result<()> {
     let says = |what: &str, text: &str| {
         let short = text.len() <= 1_000 && !text.chars().any(char::is_control);
-        if short { Ok(()) } else { Err(Error::invalid(format!("the {what} is too long, or has control characters"))) }
+        if short {
+            Ok(())
+        } else {
+            Err(Error::invalid(format!("the {what} is too long, or has control characters")))
+        }
     };
     if request.name.trim().is_empty() || request.name.len() > limits::NAME_BYTES_MAX {
-        let message = format!("the name has `{}` bytes, 1 to {} are possible", request.name.len(), limits::NAME_BYTES_MAX);
+        let message = format!(
+            "the name has `{}` bytes, 1 to {} are possible",
+            request.name.len(),
+            limits::NAME_BYTES_MAX
+        );
         return Err(Error::invalid(message));
     }
     says("name", &request.name)?;
@@ -111,7 +119,10 @@ fn frames(request: &JobRequest) -> Result<Vec<Option<i64>>> {
     let Some((first, last)) = request.frames else { return Ok(vec![None]) };
     match last.checked_sub(first) {
         Some(span) if (0..limits::FRAMES_MAX).contains(&span) => Ok((first..=last).map(Some).collect()),
-        _ => Err(Error::invalid(format!("frames `{first}` to `{last}`: 1 to {} are possible", limits::FRAMES_MAX))),
+        _ => Err(Error::invalid(format!(
+            "frames `{first}` to `{last}`: 1 to {} are possible",
+            limits::FRAMES_MAX
+        ))),
     }
 }
 

@@ -4,12 +4,12 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use protocol::keys;
 use protocol::limits::{self, CLAIM_MAX};
 use protocol::work::{
-    Claim, ClaimRequest, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest,
-    PROTOCOL_VERSION, RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
+    Claim, ClaimRequest, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest, PROTOCOL_VERSION,
+    RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
 };
-use protocol::keys;
 
 use super::{Coordinator, lock};
 use crate::db::claim::Claimer;
@@ -122,14 +122,16 @@ impl Coordinator {
     async fn try_claim(&self, request: &ClaimRequest, session: &Session) -> Result<Option<Claim>> {
         let start = Instant::now();
         let warm: Vec<(i64, i64)> = request.warm.iter().take(8).map(|w| (w.pass, w.segment)).collect();
-        let (candidates, alive) = self.read_farm(|farm| {
-            let now = self.now();
-            let worker = farm.workers.get(&session.worker).filter(|w| !w.withheld && !session.draining)?;
-            let max = request.max.clamp(1, CLAIM_MAX);
-            let asker = Asker { name: &session.worker, worker, warm: &warm, max };
-            Some((choose(farm, &asker, now, random::bits()), farm.alive(now)))
-        })
-        .unwrap_or_default();
+        let (candidates, alive) = self
+            .read_farm(|farm| {
+                let now = self.now();
+                let worker =
+                    farm.workers.get(&session.worker).filter(|w| !w.withheld && !session.draining)?;
+                let max = request.max.clamp(1, CLAIM_MAX);
+                let asker = Asker { name: &session.worker, worker, warm: &warm, max };
+                Some((choose(farm, &asker, now, random::bits()), farm.alive(now)))
+            })
+            .unwrap_or_default();
         for candidate in candidates {
             let claimer = Claimer {
                 worker: &session.worker,
@@ -180,11 +182,7 @@ impl Coordinator {
     ///
     /// # Errors
     /// [`Kind::Gone`] when the session is over.
-    pub async fn heartbeat(
-        &self,
-        request: &HeartbeatRequest,
-        token: Option<&str>,
-    ) -> Result<HeartbeatReply> {
+    pub async fn heartbeat(&self, request: &HeartbeatRequest, token: Option<&str>) -> Result<HeartbeatReply> {
         let session = self.session(&request.session, token).await?;
         let leases: Vec<String> = request.leases.iter().take(256).map(|l| l.lease.clone()).collect();
         let ttl = self.settings.lease_ttl_ms;
@@ -279,7 +277,10 @@ impl Drop for Waiting<'_> {
 fn check_items(request: &CompleteRequest) -> Result<()> {
     use protocol::work::Outcome;
     if request.items.is_empty() || request.items.len() as i64 > CLAIM_MAX {
-        return Err(Error::invalid(format!("`{}` results, 1 to {CLAIM_MAX} are possible", request.items.len())));
+        return Err(Error::invalid(format!(
+            "`{}` results, 1 to {CLAIM_MAX} are possible",
+            request.items.len()
+        )));
     }
     let mut batches: Vec<i64> = request.items.iter().map(|item| item.batch).collect();
     batches.sort_unstable();

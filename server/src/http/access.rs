@@ -105,7 +105,8 @@ pub async fn guard(State(api): State<Arc<Api>>, mut request: Request, next: Next
     };
     // What the document does not know, nobody may do
     let Some(&needed) = api.roles.get(&(method.clone(), path.clone())) else {
-        return Error::not_found("operation", request.uri().path()).into_response();
+        let message = format!("`{}` has no such method", request.uri().path());
+        return Error::new(Kind::Method, message).into_response();
     };
     let address = request.extensions().get::<ConnectInfo<SocketAddr>>();
     let address = address.map_or_else(String::new, |ConnectInfo(address)| address.ip().to_string());

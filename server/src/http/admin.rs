@@ -155,7 +155,9 @@ pub async fn create_ticket(
     confined(&caller)?;
     let named = request.labels.iter().all(|label| limits::is_name(label));
     if !(1..=100_000).contains(&request.uses) || request.labels.len() > limits::LABELS_MAX || !named {
-        return Err(Error::invalid("a ticket has 1 to 100000 uses, and labels of letters, digits, `-`, `_`, `.`, `=`"));
+        return Err(Error::invalid(
+            "a ticket has 1 to 100000 uses, and labels of letters, digits, `-`, `_`, `.`, `=`",
+        ));
     }
     let now = api.coordinator.now();
     let (id, secret) = new_secret(now);
@@ -225,7 +227,9 @@ pub async fn put_project(
     confined(&caller)?;
     let possible = (1..=1_000_000).contains(&project.share) && project.running_max.is_none_or(|max| max >= 0);
     if name != project.name || !limits::is_name(&name) || !possible {
-        return Err(Error::invalid("a project has the name of its path, a share from 1 to 1000000, and `running_max` 0 or more"));
+        return Err(Error::invalid(
+            "a project has the name of its path, a share from 1 to 1000000, and `running_max` 0 or more",
+        ));
     }
     api.coordinator.store.put_project(&project).await?;
     api.coordinator.changed([]);

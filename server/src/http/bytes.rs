@@ -25,14 +25,10 @@ pub struct AssetQuery {
     project: Option<String>,
 }
 
-/// A claim of a batch.
+/// A claim of a batch, and how much of its log.
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 pub struct LogQuery {
-    /// The pass.
-    pass: i64,
-    /// The batch.
-    batch: i64,
     /// The fence of the claim; the latest claim's if left out.
     fence: Option<i64>,
     /// Bytes of the log to leave out at its beginning.
@@ -50,7 +46,10 @@ pub async fn missing_assets(
 ) -> Result<Json<MissingReply>> {
     caller.project_or(Some(&request.project))?;
     if request.sha256.len() > limits::FILES_MAX || !request.sha256.iter().all(|hash| keys::is_sha256(hash)) {
-        return Err(Error::invalid(format!("up to {} SHA-256 in lower case are possible", limits::FILES_MAX)));
+        return Err(Error::invalid(format!(
+            "up to {} SHA-256 in lower case are possible",
+            limits::FILES_MAX
+        )));
     }
     let missing = api.coordinator.store.missing_assets(&request.project, &request.sha256).await?;
     Ok(Json(MissingReply { missing }))
@@ -101,22 +100,25 @@ pub async fn output(
     Ok(outgoing(sent, is_part, Some((&output.sha256, &output.name))))
 }
 
-/// The log of one claim of a batch.
-#[utoipa::path(get, path = "/v1/jobs/{id}/logs", tag = "jobs", security(("token" = ["viewer"])),
-    params(("id" = String, Path), LogQuery), responses((status = 200, body = str, content_type = "text/plain")))]
+/// The log of one claim of a batch; empty where the worker has said nothing.
+#[utoipa::path(get, path = "/v1/jobs/{id}/passes/{pass}/batches/{batch}/log", tag = "jobs",
+    security(("token" = ["viewer"])),
+    params(("id" = String, Path), ("pass" = i64, Path), ("batch" = i64, Path), LogQuery),
+    responses((status = 200, body = str, content_type = "text/plain")))]
 pub async fn log(
     State(api): State<Arc<Api>>,
     caller: Caller,
-    Path(job): Path<String>,
+    Path((job, pass, batch)): Path<(String, i64, i64)>,
     Query(query): Query<LogQuery>,
 ) -> Result<Response> {
     let job = api.job(&caller, &job).await?;
-    let page = api.coordinator.store.batches(&job.id, query.pass, None, query.batch.saturating_sub(1), 1).await?;
-    let batch = page.batches.into_iter().find(|batch| batch.batch == query.batch);
-    let batch = batch.ok_or_else(|| Error::not_found("batch", query.batch))?;
-    let key = keys::log(&job.id, query.pass, query.batch, query.fence.unwrap_or(batch.fence));
+    let page = api.coordinator.store.batches(&job.id, pass, None, batch.saturating_sub(1), 1).await?;
+    let found = page.batches.into_iter().find(|found| found.batch == batch);
+    let found = found.ok_or_else(|| Error::not_found("batch", batch))?;
+    let key = keys::log(&job.id, pass, batch, query.fence.unwrap_or(found.fence));
     let log = api.coordinator.storage.get(&key).await?.unwrap_or_default();
-    let headers = [(header::CONTENT_TYPE, "text/plain; charset=utf-8"), (header::X_CONTENT_TYPE_OPTIONS, "nosniff")];
+    let headers =
+        [(header::CONTENT_TYPE, "text/plain; charset=utf-8"), (header::X_CONTENT_TYPE_OPTIONS, "nosniff")];
     Ok((headers, log.slice(query.offset.min(log.len())..)).into_response())
 }
 

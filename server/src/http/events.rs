@@ -134,7 +134,8 @@ impl Listener {
             let found = self.api.coordinator.store.token(&token.detail.id).await;
             let now = self.api.coordinator.now();
             let over = |end: Option<i64>| end.is_some_and(|end| end <= now);
-            let live = |detail: &protocol::admin::TokenDetail| !over(detail.revoked_at) && !over(detail.expires_at);
+            let live =
+                |detail: &protocol::admin::TokenDetail| !over(detail.revoked_at) && !over(detail.expires_at);
             match found {
                 Ok(found) => self.ended = !found.is_some_and(|token| live(&token.detail)),
                 Err(error) => tracing::debug!(%error, "a listener's token cannot be looked up"),

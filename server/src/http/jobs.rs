@@ -161,7 +161,9 @@ pub async fn patch(
         || patch.running_max.is_some_and(|max| max < 1)
         || patch.comment.as_ref().is_some_and(|text| text.len() > 1_000 || text.chars().any(char::is_control))
     {
-        return Err(Error::invalid("priority is from 0 to 100, `running_max` 1 or more, a comment up to 1000 bytes"));
+        return Err(Error::invalid(
+            "priority is from 0 to 100, `running_max` 1 or more, a comment up to 1000 bytes",
+        ));
     }
     api.coordinator.store.patch(&job.id, &patch, caller.name(), api.coordinator.now()).await?;
     api.changed(&job.id).await
@@ -313,5 +315,7 @@ pub async fn manifest(
 ) -> Result<Json<Manifest>> {
     let job = api.job(&caller, &id).await?;
     let manifest = api.coordinator.manifest(&job.id).await?;
-    manifest.map(Json).ok_or_else(|| Error::not_found("manifest of job", &id).hint("it is there when the job has succeeded"))
+    manifest.map(Json).ok_or_else(|| {
+        Error::not_found("manifest of job", &id).hint("it is there when the job has succeeded")
+    })
 }

@@ -9,6 +9,8 @@ mod events;
 mod extract;
 mod health;
 mod jobs;
+#[cfg(test)]
+mod tests;
 mod work;
 
 use std::collections::BTreeMap;
@@ -25,10 +27,9 @@ use tokio::net::TcpListener;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-pub use self::admin::make_token;
 use self::access::{Roles, Tokens, guard};
+pub use self::admin::make_token;
 use crate::coordinator::Coordinator;
-use crate::error::Kind;
 use crate::{Error, Result};
 
 /// Time for requests that are under way when the coordinator is asked to end.
@@ -154,9 +155,7 @@ pub fn router(coordinator: Arc<Coordinator>) -> Router {
         failed_enrolments: Mutex::default(),
     });
     let unknown = async |request: Request| Error::not_found("operation", request.uri().path());
-    let other_method = async || Error::new(Kind::Method, "the operation has no such method");
     router
-        .method_not_allowed_fallback(other_method)
         .route_layer(middleware::from_fn_with_state(api.clone(), guard))
         .layer(DefaultBodyLimit::max(limits::REQUEST_BYTES_MAX))
         .fallback(unknown)

@@ -1,0 +1,101 @@
+//! `pantaray serve`: the coordinator.
+
+use std::net::{IpAddr, SocketAddr};
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use clap::Args;
+use engine::{Error, Result};
+use protocol::Role;
+use protocol::admin::TokenRequest;
+use serde_json::json;
+use server::config::Settings;
+use server::coordinator::Coordinator;
+
+use super::{Place, block_on, write_secret};
+use crate::console::Answer;
+use crate::signals;
+
+/// Run the farm's coordinator until it is stopped
+#[derive(Debug, Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    place: Place,
+    /// Everything in one folder: a SQLite file and the objects; nothing else is needed
+    #[arg(long, conflicts_with_all = ["database", "storage"])]
+    embedded: bool,
+    /// Where to listen
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8470")]
+    listen: SocketAddr,
+    /// Where objects are: a folder, or `s3://BUCKET`, `gs://BUCKET`, `az://CONTAINER` [default: a folder beside the database]
+    #[arg(long, value_name = "PLACE", env = "PANTARAY_STORAGE")]
+    storage: Option<String>,
+    /// Scenes may name files below DIR as `root:NAME/path`; may be repeated
+    #[arg(long, value_name = "NAME=DIR", value_parser = crate::farm::pair)]
+    root: Vec<(String, PathBuf)>,
+    /// Everybody on this machine may do everything without a token; only on the loopback interface
+    #[arg(long)]
+    insecure_local: bool,
+    /// Seconds that a lease lasts without a heartbeat
+    #[arg(long, value_name = "SECONDS", default_value_t = 60, value_parser = clap::value_parser!(u32).range(5..=3600))]
+    lease: u32,
+    /// Bytes of one uploaded file at most
+    #[arg(long, value_name = "SIZE", default_value = "1TiB", value_parser = crate::values::size)]
+    upload_max: u64,
+}
+
+/// Serves until SIGTERM or SIGINT.
+pub fn run(arguments: Arguments) -> Result<Answer> {
+    let loopback = |ip: IpAddr| ip.is_loopback();
+    if arguments.insecure_local && !loopback(arguments.listen.ip()) {
+        let message = format!("`{}` can be reached from elsewhere", arguments.listen);
+        return Err(
+            Error::invalid(message).hint("`--insecure-local` wants a loopback address, such as 127.0.0.1")
+        );
+    }
+    arguments.place.make()?;
+    let folder = || arguments.place.data.join("storage").display().to_string();
+    let settings = Settings {
+        listen: arguments.listen,
+        database: arguments.place.database(),
+        connections: 32,
+        storage: arguments.storage.clone().unwrap_or_else(folder),
+        roots: arguments.root.iter().cloned().collect(),
+        without_tokens: arguments.insecure_local,
+        lease_ttl_ms: i64::from(arguments.lease) * 1_000,
+        asset_bytes_max: arguments.upload_max,
+    };
+    let (place, listen) = (arguments.place.clone(), arguments.listen);
+    let served = block_on(async move {
+        let coordinator = Coordinator::open(settings).await?;
+        let listener = tokio::net::TcpListener::bind(listen).await.map_err(|error| {
+            server::Error::new(server::error::Kind::Conflict, format!("cannot listen at `{listen}`: {error}"))
+        })?;
+        let listen = listener.local_addr()?;
+        if !coordinator.settings.without_tokens && !coordinator.store.has_tokens().await? {
+            first_token(&coordinator, &place).await?;
+        }
+        eprintln!("listening at http://{listen}");
+        server::http::serve(coordinator, listener, until_stopped()).await?;
+        Ok(listen)
+    })?;
+    Answer::new(&json!({ "listened": served.to_string() }), "stopped")
+}
+
+/// A database without tokens gets one, for its administrator.
+async fn first_token(coordinator: &Coordinator, place: &Place) -> server::Result<()> {
+    let (project, expires_s) = (None, None);
+    let request = TokenRequest { role: Role::Admin, project, label: "first".into(), expires_s };
+    let made = server::http::make_token(&coordinator.store, &request, coordinator.now()).await?;
+    let path = place.data.join("admin.token");
+    write_secret(&path, &made.secret)?;
+    eprintln!("an administrator's token is in {}", path.display());
+    Ok(())
+}
+
+async fn until_stopped() {
+    while !signals::cancel_flag().load(Ordering::Relaxed) {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
