@@ -1,9 +1,12 @@
 //! A bundle: all rays of one or a few neighbouring points, which pass through the bricks together.
 //!
 //! Rays are known by 16-bit numbers. Everything is in lattice steps relative to the bundle's reference point, so
-//! that single precision is exact where it matters: near the origins.
+//! that single precision is exact where it matters: near the origins. Inside an [instance](super::instance) the same
+//! numbers stand for the same rays on the prototype's lattice ([`Inside`]).
 
-use glam::{IVec3, Vec3};
+use glam::{DVec3, IVec3, Vec3};
+
+use super::instance::{self, Instance};
 
 /// Rays of a bundle at most.
 pub const RAYS_MAX: usize = 2048;
@@ -20,11 +23,24 @@ pub struct BoxRay {
     pub offset: [f32; 4],
 }
 
+impl BoxRay {
+    /// The ray from `origin`, relative to the bundle's reference.
+    #[inline(always)]
+    fn new(origin: Vec3, direction: Vec3) -> Self {
+        // A component of zero would make 0 * infinity; a tiny one is as good
+        let [x, y, z] =
+            direction.to_array().map(|d| 1.0 / if d.abs() < 1e-18 { 1e-18_f32.copysign(d) } else { d });
+        Self { inverse: [x, y, z, 0.0], offset: [origin.x * x, origin.y * y, origin.z * z, 0.0] }
+    }
+}
+
 /// One origin of a bundle and its range of rays.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Origin {
     /// Lattice coordinates.
     pub position: IVec3,
+    /// The same before they were rounded: what a prototype's own lattice rounds.
+    pub exact: DVec3,
     /// First ray.
     pub first: u16,
     /// One past the last ray.
@@ -42,7 +58,7 @@ pub struct Bundle {
     pub bounds: [Vec3; 2],
     /// For box tests.
     pub box_rays: Vec<BoxRay>,
-    /// Unit directions; the fourth component is 0.
+    /// Directions; the fourth component is 0. Unit vectors, but not inside an instance.
     pub directions: Vec<[f32; 4]>,
     /// Extinction met so far.
     pub extinction: Vec<u32>,
@@ -50,10 +66,25 @@ pub struct Bundle {
     pub limit: Vec<u32>,
     /// Bit i: ray i has not ended.
     pub alive: [u16; RAYS_MAX / 16],
-    /// Rays end after this many steps; infinite if nothing limits them.
+    /// Rays end after this many times their direction; infinite if nothing limits them.
     pub reach: f32,
-    /// Hits nearer than this many steps are tested again in double precision.
+    /// Hits nearer than this many times the direction are tested again in double precision.
     pub near: f32,
+    /// No direction is longer than this many steps; 1 but inside an instance.
+    pub stretch: f32,
+}
+
+/// What is different about a bundle's rays inside an instance; outside, what they are to come back to.
+#[derive(Debug)]
+pub struct Inside {
+    reference: IVec3,
+    origins: Vec<Origin>,
+    bounds: [Vec3; 2],
+    box_rays: Vec<BoxRay>,
+    directions: Vec<[f32; 4]>,
+    reach: f32,
+    near: f32,
+    stretch: f32,
 }
 
 /// Extinction that no limit reaches: what an opaque face adds.
@@ -73,6 +104,7 @@ impl Bundle {
             alive: [0; RAYS_MAX / 16],
             reach: f32::INFINITY,
             near: 0.0,
+            stretch: 1.0,
         }
     }
 
@@ -97,8 +129,13 @@ impl Bundle {
         self.directions.is_empty()
     }
 
-    /// Starts a new origin; rays pushed from now on belong to it.
+    /// Starts a new origin on the lattice; rays pushed from now on belong to it.
     pub fn push_origin(&mut self, position: IVec3) {
+        self.push_rounded_origin(position, position.as_dvec3());
+    }
+
+    /// Starts a new origin that was rounded to `position` from `exact`, both in lattice coordinates.
+    pub fn push_rounded_origin(&mut self, position: IVec3, exact: DVec3) {
         if self.origins.is_empty() {
             self.reference = position;
             self.bounds = [Vec3::ZERO; 2];
@@ -106,7 +143,7 @@ impl Bundle {
         let relative = (position - self.reference).as_vec3();
         self.bounds = [self.bounds[0].min(relative), self.bounds[1].max(relative)];
         let first = self.len() as u16;
-        self.origins.push(Origin { position, first, end: first });
+        self.origins.push(Origin { position, exact, first, end: first });
     }
 
     /// Adds a ray of the newest origin. `limit` is the extinction at which it ends.
@@ -116,11 +153,7 @@ impl Bundle {
         debug_assert!(ray < RAYS_MAX);
         let Some(origin) = self.origins.last_mut() else { return };
         let relative = (origin.position - self.reference).as_vec3();
-        // A component of zero would make 0 * infinity; a tiny one is as good
-        let inverse =
-            direction.to_array().map(|d| 1.0 / if d.abs() < 1e-18 { 1e-18_f32.copysign(d) } else { d });
-        let offset = [relative.x * inverse[0], relative.y * inverse[1], relative.z * inverse[2], 0.0];
-        self.box_rays.push(BoxRay { inverse: [inverse[0], inverse[1], inverse[2], 0.0], offset });
+        self.box_rays.push(BoxRay::new(relative, direction));
         self.directions.push([direction.x, direction.y, direction.z, 0.0]);
         self.extinction.push(0);
         self.limit.push(limit);
@@ -145,6 +178,76 @@ impl Bundle {
     #[inline(always)]
     pub fn is_alive(&self, ray: u16) -> bool {
         self.alive[usize::from(ray) / 16] >> (ray % 16) & 1 != 0
+    }
+}
+
+impl Inside {
+    /// Memory for [`RAYS_MAX`] rays.
+    pub fn new() -> Self {
+        Self {
+            reference: IVec3::ZERO,
+            origins: Vec::with_capacity(POINTS_MAX),
+            bounds: [Vec3::ZERO; 2],
+            box_rays: vec![BoxRay::default(); RAYS_MAX],
+            directions: vec![[0.0; 4]; RAYS_MAX],
+            reach: f32::INFINITY,
+            near: 0.0,
+            stretch: 1.0,
+        }
+    }
+
+    /// Takes the rays numbered `rays`, ascending, of a bundle that is not inside an instance into one whose decoded box has the
+    /// lower corner `corner`. They get there by [`swap`](Self::swap). Operations have one order and are not fused.
+    #[inline(always)]
+    pub fn place(&mut self, bundle: &Bundle, rays: &[u16], instance: &Instance, corner: IVec3) {
+        self.origins.clear();
+        self.bounds = [Vec3::ZERO; 2];
+        let corner = corner.as_dvec3();
+        let [x, y, z] = instance.directions();
+        let mut at = 0;
+        for origin in &bundle.origins {
+            // A vertex that was placed in the map comes back to its own integers here
+            let exact = instance.point(origin.exact - corner);
+            let position = instance::round(exact);
+            if self.origins.is_empty() {
+                self.reference = position;
+            }
+            let relative = position.wrapping_sub(self.reference).as_vec3();
+            self.bounds = [self.bounds[0].min(relative), self.bounds[1].max(relative)];
+            self.origins.push(Origin { position, exact, ..*origin });
+            while at < rays.len() && rays[at] < origin.end {
+                let ray = usize::from(rays[at]);
+                let [dx, dy, dz, _] = bundle.directions[ray];
+                let direction = (x * dx + y * dy) + z * dz;
+                self.box_rays[ray] = BoxRay::new(relative, direction);
+                self.directions[ray] = [direction.x, direction.y, direction.z, 0.0];
+                at += 1;
+            }
+        }
+        let scale = instance.ray_scale();
+        (self.reach, self.near) = (bundle.reach * scale, bundle.near * scale);
+        // Never less than the largest stretch
+        let squares = (x.length_squared() + y.length_squared()) + z.length_squared();
+        self.stretch = 1.000_01 * squares.sqrt();
+    }
+
+    /// Takes a bundle's rays in or out. What has become of them stays with the bundle.
+    #[inline(always)]
+    pub fn swap(&mut self, bundle: &mut Bundle) {
+        std::mem::swap(&mut self.reference, &mut bundle.reference);
+        std::mem::swap(&mut self.origins, &mut bundle.origins);
+        std::mem::swap(&mut self.bounds, &mut bundle.bounds);
+        std::mem::swap(&mut self.box_rays, &mut bundle.box_rays);
+        std::mem::swap(&mut self.directions, &mut bundle.directions);
+        std::mem::swap(&mut self.reach, &mut bundle.reach);
+        std::mem::swap(&mut self.near, &mut bundle.near);
+        std::mem::swap(&mut self.stretch, &mut bundle.stretch);
+    }
+}
+
+impl Default for Inside {
+    fn default() -> Self {
+        Self::new()
     }
 }
 

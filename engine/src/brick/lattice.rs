@@ -68,6 +68,11 @@ impl Lattice {
         (steps - self.origin).clamp(-limit, limit).as_ivec3()
     }
 
+    /// The coordinates of `position`, not rounded.
+    pub fn exact(&self, position: DVec3) -> DVec3 {
+        position * exp2(-self.exponent) - self.origin.as_dvec3()
+    }
+
     /// The position of a vertex with the given coordinates, in scene units.
     pub fn position(&self, coordinates: IVec3) -> DVec3 {
         (self.origin + coordinates.as_i64vec3()).as_dvec3() * self.step()

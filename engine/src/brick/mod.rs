@@ -2,7 +2,7 @@
 //!
 //! A brick is a treelet of at most 256 nodes with all its leaves, contiguous in memory and on disk. Inside it, all
 //! references are 14 bits; a child may be another brick. [`lattice`] has the integer coordinates, [`node`] and
-//! [`leaf`] the two records, [`far`] what stands in for a child, [`intersect`] rays against faces, [`bundle`] the rays of a few points, [`lanes`] the inner
+//! [`leaf`] the two records, [`far`] what stands in for a child, [`instance`] what refers to a prototype, [`intersect`] rays against faces, [`bundle`] the rays of a few points, [`lanes`] the inner
 //! loops per instruction set, [`walk`] any hit over bricks.
 //!
 //! ```text
@@ -14,11 +14,12 @@
 //!      24  nodes          u16      1 to 256, the root first, children after their parents
 //!      26  children       u16      entries of the table of brick numbers, 0 to 256
 //!      28  reserved       36 bytes of zero
-//!      64  nodes, 128 bytes each; then the table of brick numbers, u64 each; then the leaves
+//!      64  nodes, 128 bytes each; then the table of brick numbers, u64 each; then leaves and instances
 //! ```
 
 pub mod bundle;
 pub mod far;
+pub mod instance;
 pub mod intersect;
 pub mod lanes;
 pub mod lattice;
@@ -28,6 +29,7 @@ pub mod walk;
 
 use xxhash_rust::xxh3::xxh3_64;
 
+pub use instance::{INSTANCE_BYTES, Instance};
 pub use lattice::Lattice;
 pub use node::{Child, LatticeBox, Node};
 
@@ -125,6 +127,12 @@ impl<'a> Brick<'a> {
                             && leaf::Layout::read(&bytes[at..length], node.child_box(slot).min)
                                 .is_some_and(|l| l.is_sound(&bytes[at..]))
                     }
+                    Some(Child::Instance(offset)) => {
+                        let at = from + node::LOCATION_BYTES * usize::from(offset);
+                        at >= leaves
+                            && at + INSTANCE_BYTES <= length
+                            && Instance::read(&bytes[at..]).is_sound(number)
+                    }
                     None => false,
                 };
                 if !sound {
@@ -198,8 +206,8 @@ pub fn brick_bytes(nodes: usize, children: usize, leaf_bytes: usize) -> usize {
     (leaves_offset(nodes, children) + leaf_bytes).next_multiple_of(ALIGNMENT)
 }
 
-/// Appends a brick to `out`. Children of `nodes` are given by index: nodes in `nodes`, bricks in `children`, leaves by
-/// their offset in `leaves` in units of 4 bytes; here they get the places where things come to lie.
+/// Appends a brick to `out`. Children of `nodes` are given by index: nodes in `nodes`, bricks in `children`, leaves and
+/// instances by their offset in `leaves` in units of 4 bytes; here they get the places where things come to lie.
 ///
 /// # Panics
 /// When counts or bytes exceed [`NODES_MAX`], [`CHILDREN_MAX`] or [`BYTES_MAX`]: a builder's mistake.
@@ -224,6 +232,9 @@ pub fn assemble(
                 Child::Leaf(offset) => {
                     Child::Leaf(distance(first_leaf + node::LOCATION_BYTES * usize::from(offset)))
                 }
+                Child::Instance(offset) => {
+                    Child::Instance(distance(first_leaf + node::LOCATION_BYTES * usize::from(offset)))
+                }
             }
             .encode();
         }
@@ -246,7 +257,8 @@ pub fn assemble(
     brick[8..16].copy_from_slice(&checksum.to_le_bytes());
 }
 
-/// Gives a brick that [`assemble`] made, and its references to other bricks, numbers that are higher by `base`.
+/// Gives a brick that [`assemble`] made, and its references to other bricks, numbers that are higher by `base`. What its
+/// instances refer to was numbered before.
 pub fn renumber(brick: &mut [u8], base: u32) {
     let view = Brick::trusted(brick);
     let table = table_offset(view.node_count());
@@ -323,6 +335,9 @@ mod tests {
             Child::Brick(0),
             Child::Leaf(0),
             Child::Leaf(4000),
+            Child::Instance(0),
+            Child::Instance(40),
+            Child::Instance(4000),
         ] {
             let (mut bytes, length) = small_brick();
             bytes[HEADER_BYTES + 16..HEADER_BYTES + 18].copy_from_slice(&child.encode().to_le_bytes());

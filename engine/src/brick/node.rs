@@ -33,11 +33,14 @@ pub enum Child {
     Leaf(u16),
     /// Another brick: where its number stands in this brick's table.
     Brick(u16),
+    /// A prototype's tree under a map: where the [record](super::instance) lies in this brick.
+    Instance(u16),
 }
 
 const KIND_NODE: u16 = 0;
 const KIND_LEAF: u16 = 1;
 const KIND_BRICK: u16 = 2;
+const KIND_INSTANCE: u16 = 3;
 /// Bits of a child's location.
 pub const LOCATION_BITS: u32 = 14;
 /// Bytes of a unit of location.
@@ -50,20 +53,21 @@ impl Child {
             Self::Node(location) => (KIND_NODE, location),
             Self::Leaf(location) => (KIND_LEAF, location),
             Self::Brick(location) => (KIND_BRICK, location),
+            Self::Instance(location) => (KIND_INSTANCE, location),
         };
         debug_assert!(location < 1 << LOCATION_BITS);
         kind << LOCATION_BITS | location
     }
 
-    /// What the 16 bits say; none for a kind that this version does not know.
+    /// What the 16 bits say.
     #[inline(always)]
-    pub fn decode(bits: u16) -> Option<Self> {
+    pub fn decode(bits: u16) -> Self {
         let location = bits & ((1 << LOCATION_BITS) - 1);
         match bits >> LOCATION_BITS {
-            KIND_NODE => Some(Self::Node(location)),
-            KIND_LEAF => Some(Self::Leaf(location)),
-            KIND_BRICK => Some(Self::Brick(location)),
-            _ => None,
+            KIND_NODE => Self::Node(location),
+            KIND_LEAF => Self::Leaf(location),
+            KIND_BRICK => Self::Brick(location),
+            _ => Self::Instance(location),
         }
     }
 }
@@ -176,9 +180,10 @@ impl Node {
         }))
     }
 
-    /// What the child is; none for a kind that this version does not know.
+    /// What the child is; none beyond those in use.
+    #[inline(always)]
     pub fn child(&self, slot: usize) -> Option<Child> {
-        Child::decode(self.children[slot])
+        (slot < usize::from(self.count)).then(|| Child::decode(self.children[slot]))
     }
 }
 
@@ -215,9 +220,11 @@ mod tests {
     /// Catches a child that changes on its way through 16 bits.
     #[test]
     fn children_round_trip() {
-        for child in [Child::Node(255), Child::Leaf(0), Child::Leaf((1 << 14) - 1), Child::Brick(7)] {
-            assert_eq!(Child::decode(child.encode()), Some(child));
+        let far = (1 << 14) - 1;
+        for child in
+            [Child::Node(255), Child::Leaf(0), Child::Leaf(far), Child::Brick(7), Child::Instance(far)]
+        {
+            assert_eq!(Child::decode(child.encode()), child);
         }
-        assert_eq!(Child::decode(u16::MAX), None);
     }
 }

@@ -168,7 +168,8 @@ impl<B: Bricks> State<'_, B> {
                     }
                 }
             }
-            None => {}
+            // A map with instances is not traced by the kernel yet
+            Some(Child::Instance(_)) | None => {}
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use glam::{IVec3, Vec3};
+use glam::{DVec3, IVec3, Vec3};
 
 use super::stream::TraceOptions;
 use crate::Result;
@@ -72,6 +72,8 @@ pub(super) struct Piece {
 pub(super) struct Setup {
     /// Origins of the points, in lattice coordinates.
     pub origins: Vec<IVec3>,
+    /// The same before they were rounded.
+    pub exact: Vec<DVec3>,
     /// Their box.
     pub bounds: LatticeBox,
     /// Steradians that a ray stands for, where that is least.
@@ -108,6 +110,7 @@ impl Setup {
             open2: options.lod.node_open2(solid_angle),
             near: (NEAR_METERS / (meters_per_unit * lattice.step())) as f32,
             reach: shading.shader.max_distance.map_or(f32::INFINITY, |d| (d / lattice.step()) as f32),
+            exact: points.iter().map(|point| lattice.exact(point.position)).collect(),
             origins,
             bounds,
             solid_angle,

@@ -12,7 +12,7 @@ use super::setup::{Piece, Prepared, Setup, Shading};
 use crate::batch::Point;
 use crate::brick::bundle::{Bundle, RAYS_MAX};
 use crate::brick::lanes::InstructionSet;
-use crate::brick::walk::{Bricks, Counts, Scratch, Waiting, walk};
+use crate::brick::walk::{Bricks, Counts, Scratch, Start, Waiting, walk};
 use crate::cut::arena::ArenaCounts;
 use crate::cut::{Arena, Lod};
 use crate::shade::sh_occlusion::project;
@@ -141,7 +141,7 @@ impl SphericalTracer {
             select_seconds: seconds,
             ..BatchCounts::default()
         };
-        let root = self.arena.map().root();
+        let root = Start { brick: self.arena.map().root(), entrance: None };
         let job = Job { points, shading, setup, root, instructions: self.options.instructions, cancel };
         self.run(&job, is_resident, &mut counts, out)?;
         counts.trace_seconds = start.elapsed().as_secs_f64() - counts.select_seconds;
@@ -246,7 +246,7 @@ impl SphericalTracer {
 
     /// Fills the arena with bricks that rays wait for, in brick order as far as they fit.
     fn refill(&mut self, suspended: &[Suspended]) -> Result<()> {
-        load_waiting(&mut self.arena, suspended.iter().flat_map(|s| s.waiting.iter().map(|w| w.brick)))
+        load_waiting(&mut self.arena, suspended.iter().flat_map(|s| s.waiting.iter().map(|w| w.start.brick)))
     }
 }
 
@@ -272,7 +272,7 @@ struct Job<'a> {
     points: &'a [Point],
     shading: &'a Shading,
     setup: Setup,
-    root: u32,
+    root: Start,
     instructions: InstructionSet,
     cancel: &'a AtomicBool,
 }
@@ -288,15 +288,15 @@ impl Job<'_> {
             None => {
                 let rays: [u16; RAYS_MAX] = std::array::from_fn(|ray| ray as u16);
                 let rays = &rays[..bundle.len()];
-                walk(arena, self.root, rays, self.setup.open2, bundle, scratch, self.instructions);
+                walk(arena, &self.root, rays, self.setup.open2, bundle, scratch, self.instructions);
             }
             Some(old) => {
                 for (ray, &extinction) in old.extinction.iter().enumerate() {
                     bundle.extinguish(ray as u16, extinction);
                 }
-                for Waiting { brick, first, count } in old.waiting {
+                for Waiting { start, first, count } in old.waiting {
                     let rays = &old.rays[first as usize..(first + count) as usize];
-                    walk(arena, brick, rays, self.setup.open2, bundle, scratch, self.instructions);
+                    walk(arena, &start, rays, self.setup.open2, bundle, scratch, self.instructions);
                 }
             }
         }
@@ -316,7 +316,7 @@ impl Job<'_> {
         bundle.clear(self.setup.reach, self.setup.near);
         for point in piece.points.clone() {
             let Point { index, normal, .. } = self.points[point];
-            bundle.push_origin(self.setup.origins[point]);
+            bundle.push_rounded_origin(self.setup.origins[point], self.setup.exact[point]);
             let (normal, spread) = self.shading.spread(normal);
             self.shading.sampler.push_rays(index, normal, spread, piece.samples.clone(), bundle);
         }

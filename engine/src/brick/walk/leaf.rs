@@ -81,7 +81,8 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
             let gap = lower.max(-(lower + extent)).max(0.0);
             gap2 += gap * gap;
         }
-        gap2 <= self.bundle.near * self.bundle.near
+        let near = self.bundle.near * self.bundle.stretch;
+        gap2 <= near * near
     }
 
     /// Looks again, in double precision, at those of `hits` that are near. The faces that are met.
@@ -119,7 +120,12 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
             let origin =
                 self.bundle.origins.iter().find(|origin| ray < origin.end).expect("every ray has an origin");
             let (position, direction) = (origin.position, self.bundle.directions[usize::from(ray)]);
-            let direction = Vec3::from_slice(&direction[..3]).as_dvec3();
+            let mut direction = Vec3::from_slice(&direction[..3]).as_dvec3();
+            let mut reach = reach;
+            if self.entrance.is_some() {
+                let length = direction.length();
+                (direction, reach) = (direction / length, reach * length);
+            }
             let mut faces = 0;
             for (face, decoded) in decoded[..layout.faces].iter().enumerate() {
                 faces |= u16::from(intersect::meets(decoded, position, direction, reach)) << face;

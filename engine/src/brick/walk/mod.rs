@@ -3,14 +3,19 @@
 //! All rays of a bundle go down the tree together: a node is decoded once for all of them, then each ray is tested
 //! against its eight boxes, and the rays that meet a child go on as a list of ray numbers. One order of children, near
 //! first, holds for all rays because they start at the same place. A hit adds extinction to a ray; extinctions are
-//! integers, so the order of hits does not matter, and a ray that passes its limit drops out of every list.
+//! integers, so the order of hits does not matter, and a ray that passes its limit drops out of every list. [`instances`] has
+//! what is different where one tree stands in several places.
 mod far;
+#[cfg(test)]
+mod instance_tests;
+mod instances;
 mod leaf;
 mod nodes;
 mod scratch;
 #[cfg(test)]
 pub(super) mod tests;
 
+pub use instances::{Entrance, Start};
 pub use scratch::{Counts, Scratch, Waiting};
 
 use super::bundle::Bundle;
@@ -36,13 +41,13 @@ pub trait Bricks {
     fn locate(&self, brick: u32) -> Location;
 }
 
-/// Traces the rays numbered `rays` of a bundle through brick `start` and all below it.
+/// Traces the rays numbered `rays` of a bundle through the brick at `start` and all below it.
 ///
 /// A child whose squared diagonal is less than `open2` times its squared distance from the origins is not opened: its
 /// far field stands in for it. With 0 every child of a resident brick is opened.
 pub fn walk(
     bricks: &impl Bricks,
-    start: u32,
+    start: &Start,
     rays: &[u16],
     open2: f32,
     bundle: &mut Bundle,
@@ -70,7 +75,7 @@ pub fn walk(
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt")]
 unsafe fn walk_avx2(
     bricks: &impl Bricks,
-    start: u32,
+    start: &Start,
     rays: &[u16],
     open2: f32,
     bundle: &mut Bundle,
@@ -86,7 +91,7 @@ unsafe fn walk_avx2(
 )]
 unsafe fn walk_avx512(
     bricks: &impl Bricks,
-    start: u32,
+    start: &Start,
     rays: &[u16],
     open2: f32,
     bundle: &mut Bundle,

@@ -6,8 +6,9 @@ use super::super::far;
 use super::super::lanes::{Lanes, SLACK};
 use super::super::node::{Child, LOCATION_BITS, LOCATION_BYTES, Node, WIDTH};
 use super::super::{HEADER_BYTES, bundle::RAYS_MAX};
-use super::scratch::{Entry, NO_LEAF, Scratch, Waiting};
-use super::{Bricks, Location};
+use super::instances::{Entrance, instance_at};
+use super::scratch::{Entry, INSTANCE, LEAVE, NO_LEAF, Scratch, Waiting};
+use super::{Bricks, Location, Start};
 
 /// The location's bits of a stored child.
 pub(super) const LOCATION_MASK: u16 = (1 << LOCATION_BITS) - 1;
@@ -16,7 +17,12 @@ pub(super) const LOCATION_MASK: u16 = (1 << LOCATION_BITS) - 1;
 pub(super) struct Walk<'a, L: Lanes, B: Bricks> {
     pub(super) bricks: &'a B,
     pub(super) memory: &'a [u8],
+    /// What holds where the walk is.
     pub(super) open2: f32,
+    /// What holds outside instances.
+    pub(super) open2_outside: f32,
+    /// The instance that the walk is in.
+    pub(super) entrance: Option<Entrance>,
     pub(super) bundle: &'a mut Bundle,
     pub(super) scratch: &'a mut Scratch,
     lanes: std::marker::PhantomData<L>,
@@ -28,34 +34,47 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
     #[inline(always)]
     pub(super) unsafe fn run(
         bricks: &'a B,
-        start: u32,
+        start: &Start,
         rays: &[u16],
         open2: f32,
         bundle: &'a mut Bundle,
         scratch: &'a mut Scratch,
     ) {
-        let mut walk =
-            Self { bricks, memory: bricks.memory(), open2, bundle, scratch, lanes: std::marker::PhantomData };
+        let mut walk = Self {
+            bricks,
+            memory: bricks.memory(),
+            open2,
+            open2_outside: open2,
+            entrance: None,
+            bundle,
+            scratch,
+            lanes: std::marker::PhantomData,
+        };
         walk.scratch.stack.clear();
         let count = rays.len();
-        walk.scratch.lists[..count].copy_from_slice(rays);
-        match bricks.locate(start) {
-            Location::Resident(at) => walk.scratch.stack.push(Entry {
-                address: root_node(at),
-                leaf: NO_LEAF,
-                count: count as u16,
-                first: 0,
-            }),
+        match bricks.locate(start.brick) {
+            Location::Resident(at) => {
+                walk.scratch.lists[..count].copy_from_slice(rays);
+                let entry = Entry { address: root_node(at), leaf: NO_LEAF, count: count as u16, first: 0 };
+                match start.entrance {
+                    None => walk.scratch.stack.push(entry),
+                    Some(entrance) => walk.enter(entrance, entry, rays),
+                }
+            }
             Location::Missing | Location::FarField => {
                 let scratch = &mut *walk.scratch;
                 let first = scratch.waiting_rays.len() as u32;
                 scratch.waiting_rays.extend_from_slice(rays);
-                scratch.waiting.push(Waiting { brick: start, first, count: count as u32 });
+                scratch.waiting.push(Waiting { start: *start, first, count: count as u32 });
             }
         }
         while let Some(entry) = walk.scratch.stack.pop() {
             // The list is the topmost one: what it takes becomes free for the children's lists
             let (first, end) = (entry.first as usize, entry.first as usize + usize::from(entry.count));
+            if entry.leaf == LEAVE {
+                walk.leave();
+                continue;
+            }
             let scratch = &mut *walk.scratch;
             // SAFETY: `current` has room for all rays of a bundle and the slack
             let count =
@@ -63,12 +82,14 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             if count == 0 {
                 continue;
             }
-            if entry.leaf != NO_LEAF {
+            if entry.leaf == NO_LEAF {
+                // SAFETY: as the caller's
+                unsafe { walk.visit_node(entry, count) };
+            } else if entry.leaf & INSTANCE == 0 {
                 // SAFETY: as the caller's
                 unsafe { walk.visit_leaf(entry.address, usize::from(entry.leaf), count) };
             } else {
-                // SAFETY: as the caller's
-                unsafe { walk.visit_node(entry, count) };
+                walk.visit_instance(entry, count);
             }
         }
     }
@@ -89,16 +110,17 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         unsafe { L::boxes(node, self.bundle.reference, &self.bundle.bounds, boxes) };
         let mut far_mask = 0_u8;
         let mut beyond = (0xff_u32 << node.count) as u8;
-        let reach2 = self.bundle.reach * self.bundle.reach;
+        let reach = self.bundle.reach * self.bundle.stretch;
+        let reach2 = reach * reach;
         for slot in 0..usize::from(node.count) {
             if boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot] && !far::must_open(&node.far[slot])
             {
                 far_mask |= 1 << slot;
             }
             beyond |= u8::from(boxes.distance2[slot] > reach2) << slot;
-            // A node or leaf that will be visited is asked for before the rays are tested
+            // A node, leaf or instance that will be visited is asked for before the rays are tested
             let child = node.children[slot];
-            if child >> LOCATION_BITS < 2 {
+            if child >> LOCATION_BITS != 2 {
                 prefetch(self.memory, entry.address + LOCATION_BYTES * usize::from(child & LOCATION_MASK));
             }
         }
@@ -115,7 +137,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         while rest != 0 {
             let slot = rest.trailing_zeros() as usize;
             rest &= rest - 1;
-            targets[slot] = Self::target(self.bricks, self.memory, entry.address, node.child(slot));
+            targets[slot] = self.target(entry.address, slot);
             if targets[slot] == Target::FarField {
                 far_mask |= 1 << slot;
                 continue;
@@ -157,11 +179,17 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
                     stack.push(Entry { address, leaf, count: met as u16, first: first as u32 });
                     first += met;
                 }
+                Target::Instance => {
+                    let (address, leaf) = (entry.address, slot as u16 | INSTANCE);
+                    stack.push(Entry { address, leaf, count: met as u16, first: first as u32 });
+                    first += met;
+                }
                 Target::Wait(brick) => {
+                    let start = self.start(brick, entry.address, slot);
                     let scratch = &mut *self.scratch;
-                    let start = scratch.waiting_rays.len() as u32;
+                    let begin = scratch.waiting_rays.len() as u32;
                     scratch.waiting_rays.extend_from_slice(&scratch.lists[first..first + met]);
-                    scratch.waiting.push(Waiting { brick, first: start, count: met as u32 });
+                    scratch.waiting.push(Waiting { start, first: begin, count: met as u32 });
                 }
                 Target::FarField => {}
             }
@@ -170,21 +198,33 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
 
     /// What a child of the node at `address` asks for.
     #[inline(always)]
-    fn target(bricks: &B, memory: &[u8], address: usize, child: Option<Child>) -> Target {
-        match child {
-            Some(Child::Node(offset)) => Target::Node(address + LOCATION_BYTES * usize::from(offset)),
-            Some(Child::Leaf(_)) => Target::Leaf,
-            Some(Child::Brick(offset)) => {
+    fn target(&self, address: usize, slot: usize) -> Target {
+        let child = node_at(self.memory, address).children[slot];
+        match Child::decode(child) {
+            Child::Node(offset) => Target::Node(address + LOCATION_BYTES * usize::from(offset)),
+            Child::Leaf(_) => Target::Leaf,
+            Child::Brick(offset) => {
                 let at = address + LOCATION_BYTES * usize::from(offset);
-                let number = u32::from_le_bytes(memory[at..at + 4].try_into().expect("4 bytes"));
-                match bricks.locate(number) {
+                let number = u32::from_le_bytes(self.memory[at..at + 4].try_into().expect("4 bytes"));
+                match self.bricks.locate(number) {
                     Location::Resident(at) => Target::Node(root_node(at)),
                     Location::FarField => Target::FarField,
                     Location::Missing => Target::Wait(number),
                 }
             }
-            // Checked when the brick was loaded
-            None => Target::FarField,
+            Child::Instance(_) => {
+                let instance = instance_at(self.memory, address, child);
+                let distance2 = self.scratch.boxes.distance2[slot];
+                match self.bricks.locate(instance.brick) {
+                    _ if self.entrance.is_some() || !instance.is_within_reach(distance2) => Target::FarField,
+                    Location::Resident(at) => {
+                        prefetch(self.memory, root_node(at));
+                        Target::Instance
+                    }
+                    Location::FarField => Target::FarField,
+                    Location::Missing => Target::Wait(instance.brick),
+                }
+            }
         }
     }
 }
@@ -198,13 +238,15 @@ enum Target {
     Node(usize),
     /// It is a leaf to visit.
     Leaf,
+    /// It is an instance to enter.
+    Instance,
     /// It is a brick that is not in memory.
     Wait(u32),
 }
 
 /// The byte address of a brick's root node, from the brick's in units of [`ALIGNMENT`].
 #[inline(always)]
-fn root_node(brick: u32) -> usize {
+pub(super) fn root_node(brick: u32) -> usize {
     brick as usize * ALIGNMENT + HEADER_BYTES
 }
 

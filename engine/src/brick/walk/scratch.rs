@@ -1,14 +1,15 @@
 //! A walk's memory and what it counts.
 
-use super::super::bundle::RAYS_MAX;
+use super::super::bundle::{Inside, RAYS_MAX};
 use super::super::lanes::{Boxes, Corners, Planes, SLACK};
 use super::super::node::WIDTH;
+use super::Start;
 
 /// Rays that wait for a brick: a range of [`Scratch::waiting_rays`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Waiting {
-    /// The brick.
-    pub brick: u32,
+    /// Where they go on.
+    pub start: Start,
     /// First entry of the rays' numbers.
     pub first: u32,
     /// How many.
@@ -32,6 +33,10 @@ pub struct Counts {
     pub hits: u64,
     /// Faces tested again in double precision.
     pub retests: u64,
+    /// Instances entered.
+    pub instances: u64,
+    /// Rays that entered them.
+    pub instance_rays: u64,
 }
 
 impl std::ops::AddAssign for Counts {
@@ -43,6 +48,8 @@ impl std::ops::AddAssign for Counts {
         self.far_hits += other.far_hits;
         self.hits += other.hits;
         self.retests += other.retests;
+        self.instances += other.instances;
+        self.instance_rays += other.instance_rays;
     }
 }
 
@@ -57,6 +64,7 @@ pub struct Scratch {
     pub(super) boxes: Boxes,
     pub(super) corners: Corners,
     pub(super) planes: Planes,
+    pub(super) inside: Inside,
     /// Rays that met a brick which is not in memory.
     pub waiting: Vec<Waiting>,
     /// Their numbers.
@@ -65,12 +73,13 @@ pub struct Scratch {
     pub counts: Counts,
 }
 
-/// A node or leaf to visit, with its list of rays.
+/// A node, leaf or instance to visit, with its list of rays.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Entry {
-    /// Byte address of the node, or of the node that has the leaf as a child.
+    /// Byte address of the node, or of the node that has the leaf or instance as a child.
     pub(super) address: usize,
-    /// The leaf's place among the node's children; [`NO_LEAF`] for the node itself.
+    /// The leaf's place among the node's children; that of an instance and [`INSTANCE`]; [`NO_LEAF`] for the node itself;
+    /// [`LEAVE`] where the instance that was entered last is left.
     pub(super) leaf: u16,
     /// Entries of the list.
     pub(super) count: u16,
@@ -80,6 +89,10 @@ pub(super) struct Entry {
 
 /// See [`Entry::leaf`].
 pub(super) const NO_LEAF: u16 = u16::MAX;
+/// See [`Entry::leaf`].
+pub(super) const INSTANCE: u16 = 1 << 8;
+/// See [`Entry::leaf`].
+pub(super) const LEAVE: u16 = 1 << 9;
 
 impl Scratch {
     /// Memory for bundles of [`RAYS_MAX`] rays.
@@ -98,6 +111,7 @@ impl Scratch {
             },
             corners: Corners::EMPTY,
             planes: Planes::EMPTY,
+            inside: Inside::new(),
             waiting: Vec::new(),
             waiting_rays: Vec::new(),
             counts: Counts::default(),

@@ -11,9 +11,9 @@ use crate::brick::{ALIGNMENT, LatticeBox, Node, assemble, intersect, leaf};
 use crate::math::hash::{hash32, unit_f32};
 
 /// Bricks in plain memory: brick i starts at `starts[i]`.
-struct Loaded {
-    memory: Vec<u8>,
-    starts: Vec<u32>,
+pub struct Loaded {
+    pub memory: Vec<u8>,
+    pub starts: Vec<u32>,
 }
 
 impl Bricks for Loaded {
@@ -26,26 +26,28 @@ impl Bricks for Loaded {
     }
 }
 
-struct Random(u32);
+const ROOT: Start = Start { brick: 0, entrance: None };
+
+pub struct Random(pub u32);
 
 impl Random {
-    fn next(&mut self, range: u32) -> i32 {
+    pub fn next(&mut self, range: u32) -> i32 {
         self.0 = hash32(self.0);
         (self.0 % range) as i32
     }
 
-    fn unit(&mut self) -> f32 {
+    pub fn unit(&mut self) -> f32 {
         self.0 = hash32(self.0);
         unit_f32(self.0)
     }
 
-    fn vertex(&mut self, extent: u32) -> IVec3 {
+    pub fn vertex(&mut self, extent: u32) -> IVec3 {
         IVec3::new(self.next(extent), self.next(extent), self.next(extent)) - extent as i32 / 2
     }
 }
 
 /// A two-level map of random faces: 8 bricks of one node with 8 leaves each under a root brick.
-fn random_map(random: &mut Random, extent: u32, size: u32) -> (Loaded, Vec<Face>) {
+pub fn random_map(random: &mut Random, extent: u32, size: u32) -> (Loaded, Vec<Face>) {
     let (mut memory, mut starts, mut all) = (Vec::new(), vec![0], Vec::new());
     let mut boxes = Vec::new();
     let mut bricks = Vec::new();
@@ -138,7 +140,7 @@ fn every_instruction_set_agrees_with_brute_force() {
             let reach = if case % 3 == 0 { extent as f32 / 3.0 } else { f32::INFINITY };
             let mut bundle = random_bundle(&mut random, extent, faces[0].vertices[0], reach);
             let ids: Vec<u16> = (0..bundle.len() as u16).collect();
-            walk(&map, 0, &ids, 0.0, &mut bundle, &mut Scratch::new(), instructions);
+            walk(&map, &ROOT, &ids, 0.0, &mut bundle, &mut Scratch::new(), instructions);
             for ray in 0..bundle.len() {
                 let origin = bundle.origins[ray / 64].position;
                 let direction = Vec3::from_slice(&bundle.directions[ray][..3]).as_dvec3();
@@ -173,7 +175,7 @@ fn every_instruction_set_gives_the_same_bits() {
             let mut bundle = random_bundle(&mut Random(seed), extent, faces[3].vertices[1], f32::INFINITY);
             let ids: Vec<u16> = (0..bundle.len() as u16).collect();
             let mut scratch = Scratch::new();
-            walk(&map, 0, &ids, 0.05 * (case % 2) as f32, &mut bundle, &mut scratch, instructions);
+            walk(&map, &ROOT, &ids, 0.05 * (case % 2) as f32, &mut bundle, &mut scratch, instructions);
             (bundle.extinction, bundle.alive, scratch.counts)
         };
         let plain = of(InstructionSet::Plain);

@@ -12,7 +12,7 @@ use crate::batch::Point;
 use crate::brick::BYTES_MAX;
 use crate::brick::bundle::Bundle;
 use crate::brick::lanes::InstructionSet;
-use crate::brick::walk::{Scratch, walk};
+use crate::brick::walk::{Scratch, Start, walk};
 use crate::brickmap::{BrickMap, BuildOptions, FarField, OccluderStream, build};
 use crate::cut::{Arena, Lod};
 use crate::math::hash::{hash32, unit_f32};
@@ -245,7 +245,7 @@ fn extinctions(cpu: &mut SphericalTracer, points: &[Point], shading: &Shading) -
         let mut bundle = Bundle::new();
         bundle.clear(setup.reach, setup.near);
         for point in piece.points.clone() {
-            bundle.push_origin(setup.origins[point]);
+            bundle.push_rounded_origin(setup.origins[point], setup.exact[point]);
             let (normal, spread) = shading.spread(points[point].normal);
             shading.sampler.push_rays(
                 points[point].index,
@@ -271,7 +271,8 @@ fn extinctions(cpu: &mut SphericalTracer, points: &[Point], shading: &Shading) -
         }
         let rays: Vec<u16> = (0..bundle.len() as u16).collect();
         let instructions = InstructionSet::detect();
-        walk(arena, root, &rays, setup.open2, &mut bundle, &mut Scratch::new(), instructions);
+        let start = Start { brick: root, entrance: None };
+        walk(arena, &start, &rays, setup.open2, &mut bundle, &mut Scratch::new(), instructions);
         walked.extend((0..bundle.len()).map(|ray| ended(bundle.extinction[ray], bundle.limit[ray])));
     }
     [walked, twins]
