@@ -45,6 +45,7 @@ pub fn tree(map: &BrickMap) -> Tree {
                     Child::Node(offset) => boxes[brick.child_node(index, offset)],
                     Child::Brick(offset) => roots[brick.child_brick_at(index, offset) as usize],
                     Child::Leaf(offset) => tree.add_leaf(brick.at(index, offset), node.child_box(slot).min),
+                    Child::Instance(_) => node.child_box(slot),
                 };
                 tree.stored += half_area(&node.child_box(slot));
                 boxes[index] = boxes[index].union(bounds);
