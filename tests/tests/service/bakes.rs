@@ -1,0 +1,163 @@
+//! Scenes in, decorated streams out, by real workers.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use engine::bake::{BakeOptions, Control, Quiet, bake};
+use protocol::{JobState, PassKind, Role};
+use worker::client::Client;
+use worker::run::{Options, run};
+
+use super::people::wait_until;
+use super::{SCENE, TENT, on_both};
+
+fn machine() -> BakeOptions {
+    BakeOptions { memory_bytes: 256 << 20, threads: 1, ..BakeOptions::default() }
+}
+
+fn options(client: Client, name: &str, folder: &Path) -> Options {
+    Options {
+        client,
+        name: name.into(),
+        labels: Vec::new(),
+        cache: folder.join(name),
+        cache_bytes: 1 << 30,
+        spool_bytes: 64 << 20,
+        roots: Default::default(),
+        machine: machine(),
+        grace: Duration::from_secs(1),
+    }
+}
+
+/// What one process makes of the scene.
+fn quiet_bake(folder: &Path) {
+    std::fs::create_dir_all(folder.join("models")).unwrap();
+    std::fs::write(folder.join("scene.xml"), SCENE).unwrap();
+    std::fs::write(folder.join("models/tent.obj"), TENT).unwrap();
+    let scene = engine::scene::load(&folder.join("scene.xml")).unwrap();
+    let control = Control { progress: &Quiet, cancel: &AtomicBool::new(false) };
+    bake(&scene, &machine(), &folder.join("baked"), control).unwrap();
+}
+
+/// Catches a farm whose result is not that of one process, a brick map that two racing jobs build twice, a result that
+/// cannot be had in part, and events that are lost or come again.
+#[test]
+fn a_farm_bakes_what_one_process_bakes() {
+    on_both(|service, folder| {
+        quiet_bake(folder);
+        let people = service.client(Role::Submitter);
+        let request = service.request(&people);
+        let stop = AtomicBool::new(false);
+        let jobs = std::thread::scope(|scope| {
+            let workers: Vec<_> = ["w1", "w2"]
+                .map(|name| options(service.client(Role::Worker), name, folder))
+                .into_iter()
+                .map(|options| scope.spawn(|| run(&{ options }, &stop)))
+                .collect();
+            let jobs = ["one", "two"].map(|key| people.submit(&request, key).unwrap().jobs.remove(0));
+            wait_for(&people, &jobs);
+            stop.store(true, Ordering::SeqCst);
+            for worker in workers {
+                worker.join().unwrap().unwrap();
+            }
+            jobs
+        });
+
+        // Each map is built once, and both jobs have the bytes of one process
+        let mut built = 0;
+        for job in &jobs {
+            let detail = people.job(job).unwrap();
+            assert_eq!(detail.summary.state, JobState::Succeeded, "{detail:?}");
+            built += detail.passes.iter().filter(|p| p.kind == PassKind::Build && !p.reused).count();
+            let manifest = people.manifest(job).unwrap();
+            assert_eq!(manifest.outputs.len(), 2);
+            for output in &manifest.outputs {
+                let wanted = std::fs::read(folder.join("baked").join(&output.name)).unwrap();
+                let path = folder.join("fetched");
+                let url = people.own(&format!("/v1/jobs/{job}/outputs/{}", output.name));
+                let fetched = people.download(&url, &path, 1 << 30).unwrap();
+                assert_eq!(fetched.sha256, output.sha256);
+                assert!(std::fs::read(&path).unwrap() == wanted, "{} differs", output.name);
+                let mut part = url.clone();
+                part.headers.insert("range".into(), "bytes=10-29".into());
+                people.download(&part, &path, 1 << 30).unwrap();
+                assert_eq!(std::fs::read(&path).unwrap(), wanted[10..30]);
+            }
+        }
+        assert_eq!(built, 2, "two maps, each built once");
+
+        // Events come in order, each once, and again from where a listener left off
+        let all = events(service, &jobs[0], 0);
+        let kinds: Vec<&str> = all.iter().map(|(_, kind)| kind.as_str()).collect();
+        assert_eq!(kinds, ["job.submitted", "job.running", "job.succeeded"]);
+        assert_eq!(events(service, &jobs[0], all[1].0), all[2..]);
+        service.runtime.block_on(async {
+            assert_eq!(service.coordinator.store.drift().await.unwrap(), []);
+            assert_eq!(service.coordinator.store.orphans().await.unwrap(), 0);
+        });
+    });
+}
+
+fn wait_for(client: &Client, jobs: &[String]) {
+    // A minute and a half is many times what it takes
+    for _ in 0..450 {
+        let is_over = |job: &String| client.job(job).unwrap().summary.state.is_final();
+        if jobs.iter().all(is_over) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    panic!("the jobs have no end: {:?}", jobs.iter().map(|job| client.job(job)).collect::<Vec<_>>());
+}
+
+/// The events of a job after an event: number and kind, until the job's last.
+fn events(service: &super::Service, job: &str, after: i64) -> Vec<(i64, String)> {
+    use std::io::BufRead;
+    let token = service.token(Role::Viewer, None);
+    let reply = ureq::get(format!("{}/v1/events?job={job}", service.url))
+        .header("authorization", format!("Bearer {token}"))
+        .header("last-event-id", after.to_string())
+        .call()
+        .unwrap();
+    let (mut found, mut id) = (Vec::new(), 0);
+    for line in std::io::BufReader::new(reply.into_body().into_reader()).lines() {
+        let line = line.unwrap();
+        if let Some(number) = line.strip_prefix("id: ") {
+            id = number.parse().unwrap();
+        }
+        if let Some(data) = line.strip_prefix("data: ") {
+            let event: protocol::events::Event = serde_json::from_str(data).unwrap();
+            assert!(id == 0 || event.id >= id, "{event:?}");
+            found.push((event.id, event.kind.clone()));
+            if event.kind == "job.succeeded" {
+                break;
+            }
+        }
+    }
+    found
+}
+
+/// Catches a job that waits for ever after the job before it is done.
+#[test]
+fn a_job_follows_the_one_that_it_needs() {
+    on_both(|service, folder| {
+        let people = service.client(Role::Submitter);
+        let request = service.request(&people);
+        let first = people.submit(&request, "1").unwrap().jobs.remove(0);
+        let mut after = request.clone();
+        after.depends_on = vec![first.clone()];
+        let second = people.submit(&after, "2").unwrap().jobs.remove(0);
+        let stop = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            let options = options(service.client(Role::Worker), "w", folder);
+            let worker = scope.spawn(|| run(&{ options }, &stop));
+            wait_for(&people, &[first.clone(), second.clone()]);
+            stop.store(true, Ordering::SeqCst);
+            worker.join().unwrap().unwrap();
+        });
+        let ends = [&first, &second].map(|job| people.job(job).unwrap().summary.ended_at);
+        assert!(ends[0] < ends[1], "{ends:?}");
+        wait_until(|| people.job(&second).unwrap().summary.state == JobState::Succeeded);
+    });
+}
