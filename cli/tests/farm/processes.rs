@@ -1,0 +1,231 @@
+//! Coordinator, workers and commands as processes, ended with the test.
+
+use std::net::TcpListener;
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+pub use serde_json::json;
+use tempfile::TempDir;
+
+/// Time for anything that a test waits for.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+const SCENE: &str = r#"<scene version="1" units="m" up="y">
+  <shaders>
+    <shader name="occlusion" type="sh_occlusion"> <param name="samples" value="512"/> </shader>
+  </shaders>
+  <geometries>
+    <geometry name="hill" occluder="true">
+      <stream procedural="terrain" seed="7" micropolygons="40000"/>
+      <bakeset name="hill"> <attribute name="sh" shader="occlusion"/> </bakeset>
+    </geometry>
+    <geometry name="tent" occluder="true"> <stream file="models/tent.obj"/> </geometry>
+  </geometries>
+</scene>"#;
+const TENT: &str = "v -1 0 -1\nv 1 0 -1\nv 0 2 0\nv -1 0 1\nv 1 0 1\nf 1 2 3\nf 4 3 5\nf 1 3 4\n";
+
+/// A farm with a folder of its own.
+pub struct Farm {
+    folder: TempDir,
+    port: u16,
+    coordinator: Option<Child>,
+    workers: Vec<(String, Option<Child>)>,
+}
+
+/// A worker of a farm.
+#[derive(Clone, Copy)]
+pub struct Worker(usize);
+
+impl Farm {
+    /// A coordinator, and a scene to submit.
+    pub fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(folder.path().join("scene/models")).unwrap();
+        std::fs::write(folder.path().join("scene/scene.xml"), SCENE).unwrap();
+        std::fs::write(folder.path().join("scene/models/tent.obj"), TENT).unwrap();
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let mut farm = Self { folder, port, coordinator: None, workers: Vec::new() };
+        farm.start_coordinator();
+        farm
+    }
+
+    fn at(&self, name: &str) -> String {
+        self.folder.path().join(name).to_str().unwrap().into()
+    }
+
+    fn pantaray(&self) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_pantaray"));
+        command
+            .env("PANTARAY_URL", format!("http://127.0.0.1:{}", self.port))
+            .env_remove("PANTARAY_TOKEN_FILE");
+        for name in ["http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"] {
+            command.env_remove(name);
+        }
+        command
+    }
+
+    /// What a process says is kept in a file that a failed test shows.
+    fn spawn(&self, mut command: Command, name: &str) -> Child {
+        let log = std::fs::File::options().create(true).append(true).open(self.at(&format!("{name}.log")));
+        command.env("RUST_LOG", "info").stderr(log.unwrap()).stdout(Stdio::piped()).spawn().unwrap()
+    }
+
+    /// Starts the coordinator on what it left, and waits until it listens.
+    pub fn start_coordinator(&mut self) {
+        let mut command = self.pantaray();
+        command.args(["serve", "--data", &self.at("data"), "--insecure-local", "--lease", "5", "--listen"]);
+        command.arg(format!("127.0.0.1:{}", self.port));
+        self.coordinator = Some(self.spawn(command, "coordinator"));
+        let start = Instant::now();
+        while std::net::TcpStream::connect(("127.0.0.1", self.port)).is_err() {
+            assert!(start.elapsed() < PATIENCE, "{}", self.logs());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Kills the coordinator.
+    pub fn kill_coordinator(&mut self) {
+        end(self.coordinator.take());
+    }
+
+    /// Starts a worker with a cache of its own.
+    pub fn worker(&mut self, name: &str) -> Worker {
+        let mut command = self.pantaray();
+        command.args(["worker", "--json", "--name", name, "--cache", &self.at(name), "--device", "cpu"]);
+        command.args(["--threads", "1", "--memory", "256MiB", "--grace", "0"]);
+        let child = self.spawn(command, name);
+        self.workers.push((name.into(), Some(child)));
+        Worker(self.workers.len() - 1)
+    }
+
+    fn child(&mut self, worker: Worker) -> &mut Option<Child> {
+        &mut self.workers[worker.0].1
+    }
+
+    /// Kills a worker.
+    pub fn kill(&mut self, worker: Worker) {
+        end(self.child(worker).take());
+    }
+
+    /// Ends the worker of this name.
+    pub fn end(&mut self, name: &str) {
+        self.workers.iter_mut().filter(|(other, _)| other == name).for_each(|(_, child)| end(child.take()));
+    }
+
+    /// Sends a worker a signal.
+    pub fn signal(&mut self, worker: Worker, signal: &str) {
+        let pid = self.child(worker).as_ref().unwrap().id().to_string();
+        let sent = Command::new("kill").args([format!("-{signal}"), pid]).status().unwrap();
+        assert!(sent.success());
+    }
+
+    /// Waits for a worker's end; what it says it did.
+    pub fn join(&mut self, worker: Worker) -> Value {
+        let output = self.child(worker).take().unwrap().wait_with_output().unwrap();
+        assert!(output.status.success(), "{}", self.logs());
+        serde_json::from_slice(&output.stdout).unwrap()
+    }
+
+    /// Runs a command that must succeed; its answer.
+    pub fn command(&self, arguments: &[&str]) -> Value {
+        let output = self.pantaray().args(arguments).args(["--json", "--quiet"]).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{arguments:?}: {said}\n{}", self.logs());
+        serde_json::from_slice(&output.stdout).unwrap()
+    }
+
+    /// Runs a command that must fail; its exit code and its error.
+    pub fn fails(&self, arguments: &[&str]) -> (i32, String) {
+        let output = self.pantaray().args(arguments).output().unwrap();
+        assert!(!output.status.success(), "{arguments:?}");
+        (output.status.code().unwrap(), String::from_utf8_lossy(&output.stderr).into_owned())
+    }
+
+    /// Submits the scene with a seed; the job.
+    pub fn submit(&self, seed: u32) -> String {
+        self.submit_with(seed, &[])
+    }
+
+    /// Submits with more arguments.
+    pub fn submit_with(&self, seed: u32, arguments: &[&str]) -> String {
+        let (scene, seed) = (self.at("scene/scene.xml"), seed.to_string());
+        let mut all = vec!["submit", &scene, "--seed", &seed];
+        all.extend_from_slice(arguments);
+        self.command(&all)["jobs"][0].as_str().unwrap().into()
+    }
+
+    /// Waits until `done` batches of a job are baked and others are being baked.
+    pub fn until_baking(&self, job: &str, done: i64) {
+        let start = Instant::now();
+        loop {
+            let batches = self.command(&["jobs", job])["batches"].clone();
+            let count = |state: &str| batches[state].as_i64().unwrap();
+            if count("done") >= done && count("leased") > 0 {
+                return;
+            }
+            let left = count("ready") + count("leased") > 0 || count("done") == 0;
+            assert!(left && start.elapsed() < PATIENCE, "{batches}\n{}", self.logs());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Waits for a job's success.
+    pub fn wait(&self, job: &str) {
+        let start = Instant::now();
+        loop {
+            let shown = self.command(&["jobs", job]);
+            match shown["state"].as_str().unwrap() {
+                "succeeded" => return,
+                "failed" | "cancelled" => panic!("{shown}\n{}", self.logs()),
+                _ => assert!(start.elapsed() < PATIENCE, "{shown}\n{}", self.logs()),
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// Brings a job's stream down.
+    pub fn fetch(&self, job: &str) -> (PathBuf, Vec<u8>) {
+        let folder = self.at(&format!("fetched-{job}"));
+        let manifest = self.command(&["fetch", job, "-o", &folder]);
+        assert_eq!(
+            (&manifest["incomplete"], &manifest["outputs"][0]["name"]),
+            (&json!(false), &json!("hill.mgs"))
+        );
+        let path = PathBuf::from(folder).join("hill.mgs");
+        let bytes = std::fs::read(&path).unwrap();
+        (path, bytes)
+    }
+
+    /// Compares what a job published with what one process bakes.
+    pub fn expect(&self, job: &str, seed: u32) {
+        let folder = self.at(&format!("baked-{seed}"));
+        let (scene, seed) = (self.at("scene/scene.xml"), seed.to_string());
+        self.command(&[
+            "bake", &scene, "-o", &folder, "--seed", &seed, "--device", "cpu", "--memory", "256MiB",
+        ]);
+        let baked = std::fs::read(PathBuf::from(folder).join("hill.mgs")).unwrap();
+        assert!(self.fetch(job).1 == baked, "the farm's bytes differ\n{}", self.logs());
+    }
+
+    fn logs(&self) -> String {
+        let names = self.workers.iter().map(|(name, _)| name.as_str()).chain(["coordinator"]);
+        let log = |name: &str| std::fs::read_to_string(self.at(&format!("{name}.log"))).unwrap_or_default();
+        names.map(|name| format!("--- {name}\n{}", log(name))).collect()
+    }
+}
+
+impl Drop for Farm {
+    fn drop(&mut self) {
+        self.kill_coordinator();
+        self.workers.iter_mut().for_each(|(_, child)| end(child.take()));
+    }
+}
+
+fn end(child: Option<Child>) {
+    if let Some(mut child) = child {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+}
