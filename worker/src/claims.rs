@@ -101,16 +101,22 @@ fn claim(client: &Client, pulse: &Pulse, warm: &[Warm], asked: &Receiver<Vec<War
                 pulse.end(error);
                 return None;
             }
+            Err(_) if is_unheard(asked) => return None,
             Err(error) => {
                 tracing::warn!("no answer to a claim: {error}");
                 std::thread::sleep(jitter(RETRY));
             }
         }
-        if matches!(asked.try_recv(), Err(TryRecvError::Disconnected)) {
+        if is_unheard(asked) {
             return None;
         }
     }
     None
+}
+
+/// Whether nobody waits for a claim any more.
+fn is_unheard(asked: &Receiver<Vec<Warm>>) -> bool {
+    matches!(asked.try_recv(), Err(TryRecvError::Disconnected))
 }
 
 /// Gives batches of a claim back untried, all of them where none is named.

@@ -1,5 +1,6 @@
 //! The coordinator's commands: to serve, and what administrators do.
 
+mod embedded;
 pub mod serve;
 pub mod token;
 

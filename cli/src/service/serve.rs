@@ -2,20 +2,25 @@
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use clap::Args;
 use engine::{Error, Result};
 use protocol::Role;
-use protocol::admin::TokenRequest;
+use protocol::admin::{Secret, TokenRequest};
 use serde_json::json;
 use server::config::Settings;
 use server::coordinator::Coordinator;
 
+use super::embedded::{self, Crew};
 use super::{Place, block_on, write_secret};
 use crate::console::Answer;
 use crate::signals;
+
+/// How long the token of embedded workers holds; it is revoked when their process ends in peace.
+const WORKER_TOKEN_SECONDS: i64 = 30 * 86_400;
 
 /// Run the farm's coordinator until it is stopped
 #[derive(Debug, Args)]
@@ -25,6 +30,9 @@ pub struct Arguments {
     /// Everything in one folder: a SQLite file and the objects; nothing else is needed
     #[arg(long, conflicts_with_all = ["database", "storage"])]
     embedded: bool,
+    /// Bake here, too: workers in this process, which share its cores
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "embedded", value_parser = clap::value_parser!(u16).range(0..=64))]
+    workers: u16,
     /// Where to listen
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8470")]
     listen: SocketAddr,
@@ -66,7 +74,7 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         lease_ttl_ms: i64::from(arguments.lease) * 1_000,
         asset_bytes_max: arguments.upload_max,
     };
-    let (place, listen) = (arguments.place.clone(), arguments.listen);
+    let (place, listen, count) = (arguments.place.clone(), arguments.listen, arguments.workers);
     let served = block_on(async move {
         let coordinator = Coordinator::open(settings).await?;
         let listener = tokio::net::TcpListener::bind(listen).await.map_err(|error| {
@@ -77,7 +85,9 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
             first_token(&coordinator, &place).await?;
         }
         eprintln!("listening at http://{listen}");
-        server::http::serve(coordinator, listener, until_stopped()).await?;
+        let token = if count > 0 { worker_token(&coordinator).await? } else { None };
+        let stop = until_done(coordinator.clone(), count, token, listen, place.data.join("workers"));
+        server::http::serve(coordinator, listener, stop).await?;
         Ok(listen)
     })?;
     Answer::new(&json!({ "listened": served.to_string() }), "stopped")
@@ -92,6 +102,39 @@ async fn first_token(coordinator: &Coordinator, place: &Place) -> server::Result
     write_secret(&path, &made.secret)?;
     eprintln!("an administrator's token is in {}", path.display());
     Ok(())
+}
+
+/// A token for the workers of this process; none where nobody needs one.
+async fn worker_token(coordinator: &Coordinator) -> server::Result<Option<Secret>> {
+    if coordinator.settings.without_tokens {
+        return Ok(None);
+    }
+    let (project, expires_s) = (None, Some(WORKER_TOKEN_SECONDS));
+    let request = TokenRequest { role: Role::Worker, project, label: "embedded".into(), expires_s };
+    server::http::make_token(&coordinator.store, &request, coordinator.now()).await.map(Some)
+}
+
+/// Lets the workers of this process work until it is asked to stop, and give back what they have.
+async fn until_done(
+    coordinator: Arc<Coordinator>,
+    count: u16,
+    token: Option<Secret>,
+    listen: SocketAddr,
+    folder: PathBuf,
+) {
+    let (mark, roots) = (format!("{:x}", coordinator.now() / 1_000), coordinator.settings.roots.clone());
+    let crew = Crew { count, mark, token: token.as_ref().map(|token| token.secret.clone()), roots };
+    let workers = embedded::start(&crew, listen, &folder);
+    until_stopped().await;
+    match workers {
+        Ok(workers) => drop(tokio::task::spawn_blocking(move || embedded::join(workers)).await),
+        Err(error) => eprintln!("no embedded workers: {error}"),
+    }
+    if let Some(token) = token
+        && let Err(error) = coordinator.store.revoke_token(&token.id, coordinator.now()).await
+    {
+        eprintln!("the token of the embedded workers is not revoked: {error}");
+    }
 }
 
 async fn until_stopped() {

@@ -18,7 +18,7 @@ const SCENE: &str = r#"<scene version="1" units="m" up="y">
   </shaders>
   <geometries>
     <geometry name="hill" occluder="true">
-      <stream procedural="terrain" seed="7" micropolygons="40000"/>
+      <stream procedural="terrain" seed="7" micropolygons="24000"/>
       <bakeset name="hill"> <attribute name="sh" shader="occlusion"/> </bakeset>
     </geometry>
     <geometry name="tent" occluder="true"> <stream file="models/tent.obj"/> </geometry>
