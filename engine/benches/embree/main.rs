@@ -88,13 +88,13 @@ fn main() {
     let arguments = Arguments::read();
     let assets = std::env::var_os("PANTARAY_ASSETS").map(PathBuf::from);
     println!(
-        "| scene | micropolygons | bytes each | what | M rays/s/core | x Embree | V_00 | RMSE to off | RMSE to 16k | nodes, leaves a ray |"
+        "| scene | micropolygons | bytes each | what | M rays/s/core | x Embree | V_00 | RMSE to off | RMSE to 16k | visits a ray: nodes, leaves | tests a ray: nodes, leaves |"
     );
-    println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |");
+    println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |");
     for name in &arguments.scenes {
         match scenes::scene(name, assets.as_deref()) {
             Some(mut stream) => compare(name, stream.as_mut(), &arguments),
-            None => println!("| {name} | not there | | | | | | | | |"),
+            None => println!("| {name} | not there | | | | | | | | | |"),
         }
     }
 }
@@ -143,7 +143,7 @@ fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) 
     let best = embree.as_ref().map(|_| {
         let rates = QUERIES.iter().zip(&seconds).map(|(query, seconds)| (rate(seconds), query));
         let (best, query) = rates.max_by(|a, b| a.0.total_cmp(&b.0)).expect("there are queries");
-        println!("| {name} | {triangles} triangles | | Embree, {query:?} | {best:.2} | 1 | | | | |");
+        println!("| {name} | {triangles} triangles | | Embree, {query:?} | {best:.2} | 1 | | | | | |");
         best
     });
     let reference = arguments.errors.then(|| bench.reference());
@@ -155,11 +155,13 @@ fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) 
             other.map_or("-".into(), |other| format!("{:.4}", rmse(values, other)))
         };
         println!(
-            "| {name} | {polygons} | {bytes:.1} | `--lod {lod}` | {rate:.2} | {ratio} | {mean:.4} | {} | {} | {:.2}, {:.2} |",
+            "| {name} | {polygons} | {bytes:.1} | `--lod {lod}` | {rate:.2} | {ratio} | {mean:.4} | {} | {} | {:.2}, {:.2} | {:.1}, {:.1} |",
             to((i > 0).then_some(&found[0].0)),
             to(reference.as_ref()),
             counts.walk.nodes as f64 / rays as f64,
             counts.walk.leaves as f64 / rays as f64,
+            counts.walk.node_rays as f64 / rays as f64,
+            counts.walk.leaf_rays as f64 / rays as f64,
         );
     }
 }
