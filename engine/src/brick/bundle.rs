@@ -9,9 +9,9 @@ use glam::{DVec3, IVec3, Vec3};
 use super::instance::{self, Instance};
 
 /// Rays of a bundle at most.
-pub const RAYS_MAX: usize = 2048;
+pub const RAYS_MAX: usize = 8192;
 /// Points of a bundle at most.
-pub const POINTS_MAX: usize = 8;
+pub const POINTS_MAX: usize = 16;
 
 /// What a box test reads of a ray.
 #[derive(Clone, Copy, Debug, Default)]
@@ -161,15 +161,20 @@ impl Bundle {
         origin.end = ray as u16 + 1;
     }
 
-    /// Adds extinction to a ray and ends it if that passes its limit. Whether it lives on.
+    /// Adds extinction to a ray. Whether that passes its limit.
     #[inline(always)]
-    pub fn extinguish(&mut self, ray: u16, extinction: u32) -> bool {
+    pub fn add(&mut self, ray: u16, extinction: u32) -> bool {
         let ray = usize::from(ray);
         let total = self.extinction[ray].saturating_add(extinction);
         self.extinction[ray] = total;
-        let ends = total > self.limit[ray];
+        total > self.limit[ray]
+    }
+
+    /// Adds extinction to a ray and ends it if that passes its limit. Whether it lives on.
+    pub fn extinguish(&mut self, ray: u16, extinction: u32) -> bool {
+        let ends = self.add(ray, extinction);
         if ends {
-            self.alive[ray / 16] &= !(1 << (ray % 16));
+            self.alive[usize::from(ray) / 16] &= !(1 << (ray % 16));
         }
         !ends
     }

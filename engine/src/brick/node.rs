@@ -166,18 +166,24 @@ impl Node {
     /// Half the extents of [`child_box`](Self::child_box).
     #[inline(always)]
     pub fn child_half(&self, slot: usize) -> glam::Vec3 {
-        glam::Vec3::from_array(std::array::from_fn(|axis| {
+        let mut half = glam::Vec3::ZERO;
+        for axis in 0..3 {
             let scale = f32::from_bits((u32::from(self.exponent[axis]) + 127) << 23);
-            (f32::from(self.upper[axis][slot]) - f32::from(self.lower[axis][slot])) * (0.5 * scale)
-        }))
+            half[axis] =
+                (f32::from(self.upper[axis][slot]) - f32::from(self.lower[axis][slot])) * (0.5 * scale);
+        }
+        half
     }
 
     /// The lower corner of [`child_box`](Self::child_box).
     #[inline(always)]
     pub fn lower_corner(&self, slot: usize) -> IVec3 {
-        IVec3::from_array(std::array::from_fn(|axis| {
-            self.origin[axis].wrapping_add(i32::from(self.lower[axis][slot]) << self.exponent[axis])
-        }))
+        let mut corner = IVec3::from_array(self.origin);
+        for axis in 0..3 {
+            corner[axis] =
+                corner[axis].wrapping_add(i32::from(self.lower[axis][slot]) << self.exponent[axis]);
+        }
+        corner
     }
 
     /// What the child is; none beyond those in use.

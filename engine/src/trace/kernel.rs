@@ -274,7 +274,7 @@ impl<B: Bricks> State<'_, B> {
         // SAFETY: the plain loops need no instruction set; the leaf was checked when its brick was loaded
         let mut hits = unsafe {
             Plain::corners(leaf, layout, self.origin, &mut corners);
-            Plain::planes(&corners, IVec3::ZERO, &mut planes);
+            Plain::planes(&corners, IVec3::ZERO, true, &mut planes);
             Plain::meet_planes(&planes, &self.direction)
         };
         if bundle.reach.is_finite() {

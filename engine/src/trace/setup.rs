@@ -15,7 +15,7 @@ use crate::scene::ShOcclusion;
 use crate::shade::sample::{Sampler, Spread};
 
 /// Points of a bundle, unless their rays are too many or they lie too far apart.
-const BUNDLE_POINTS: usize = 4;
+const BUNDLE_POINTS: usize = 16;
 const _: () = assert!(BUNDLE_POINTS <= POINTS_MAX);
 
 /// Hits nearer than this are tested again in double precision (paper, section 5).

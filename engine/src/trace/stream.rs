@@ -166,7 +166,7 @@ impl SphericalTracer {
             let waiting: usize = suspended.iter().map(|s| 2 * s.rays.len() + 4 * s.extinction.len()).sum();
             let admitted = match (resident, waiting < WAITING_BYTES_MAX) {
                 (true, _) => fresh.len(),
-                (false, true) => fresh.len().min(64 * self.workers.len()),
+                (false, true) => fresh.len().min(16 * self.workers.len()),
                 (false, false) => 0,
             };
             let begun = fresh.start..fresh.start + admitted;

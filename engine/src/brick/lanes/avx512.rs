@@ -7,11 +7,11 @@ use std::arch::x86_64::*;
 
 use glam::{IVec3, Vec3};
 
-use super::plain::{BOX_ERROR, Plain};
-use super::{Boxes, Corners, Lanes, Planes, SLACK};
+use super::plain::Plain;
+use super::{BOX_ERROR, Boxes, Corners, Lanes, Look, Planes, SLACK};
 use crate::brick::bundle::{BoxRay, RAYS_MAX};
 use crate::brick::leaf::{HEADER_BYTES, Kind, Layout};
-use crate::brick::node::Node;
+use crate::brick::node::{LOCATION_BITS, Node, WIDTH};
 
 /// The loops for AVX-512 F, BW, DQ, VL, VBMI and VBMI2.
 #[derive(Clone, Copy, Debug)]
@@ -22,22 +22,26 @@ const LANE_BITS_MAX: u8 = 25;
 
 impl Lanes for Avx512 {
     #[inline(always)]
-    unsafe fn filter(alive: &[u16; RAYS_MAX / 16], ids: &[u16], out: &mut [u16]) -> usize {
+    unsafe fn filter(alive: &[u16], ids: &[u16], out: &mut [u16]) -> usize {
         debug_assert!(out.len() >= ids.len() + SLACK);
-        // SAFETY: loads are masked to `ids`; stores of 32 numbers stay within the slack; `alive` is 4 vectors long
+        // SAFETY: loads are masked to `ids`; stores of 32 numbers stay within the slack; `alive` is read in chunks
         unsafe {
-            let words: [__m512i; 4] =
-                std::array::from_fn(|i| _mm512_loadu_si512(alive.as_ptr().add(32 * i).cast()));
             let (fifteen, one) = (_mm512_set1_epi16(15), _mm512_set1_epi16(1));
             let mut count = 0;
             for chunk in ids.chunks(32) {
                 let present = u32::MAX >> (32 - chunk.len());
                 let ids = _mm512_maskz_loadu_epi16(present, chunk.as_ptr().cast());
                 let word = _mm512_srli_epi16::<4>(ids);
-                let lower = _mm512_permutex2var_epi16(words[0], word, words[1]);
-                let upper = _mm512_permutex2var_epi16(words[2], word, words[3]);
-                let is_upper = _mm512_test_epi16_mask(word, _mm512_set1_epi16(64));
-                let bits = _mm512_mask_blend_epi16(is_upper, lower, upper);
+                // 64 words at a time: look them up for all rays, and keep those of the rays they belong to
+                let block = _mm512_srli_epi16::<6>(word);
+                let mut bits = _mm512_setzero_si512();
+                for (i, words) in alive.chunks_exact(64).enumerate() {
+                    let lower = _mm512_loadu_si512(words.as_ptr().cast());
+                    let upper = _mm512_loadu_si512(words.as_ptr().add(32).cast());
+                    let these = _mm512_permutex2var_epi16(lower, word, upper);
+                    let here = _mm512_cmpeq_epi16_mask(block, _mm512_set1_epi16(i as i16));
+                    bits = _mm512_mask_mov_epi16(bits, here, these);
+                }
                 let bit = _mm512_srlv_epi16(bits, _mm512_and_si512(ids, fifteen));
                 let keep = _mm512_mask_test_epi16_mask(present, bit, one);
                 let kept = _mm512_maskz_compress_epi16(keep, ids);
@@ -79,9 +83,57 @@ impl Lanes for Avx512 {
     }
 
     #[inline(always)]
+    unsafe fn look(node: &Node, boxes: &Boxes, open2: f32, reach2: f32) -> Look {
+        // SAFETY: arrays of 8
+        unsafe {
+            let distance2 = _mm256_loadu_ps(boxes.distance2.as_ptr());
+            let diagonal2 = _mm256_loadu_ps(boxes.diagonal2.as_ptr());
+            let limit = _mm256_mul_ps(_mm256_set1_ps(open2), distance2);
+            let beyond = _mm256_cmp_ps_mask::<_CMP_GT_OQ>(distance2, _mm256_set1_ps(reach2));
+            let children = _mm_loadu_si128(node.children.as_ptr().cast());
+            let kind = _mm_srli_epi16::<{ LOCATION_BITS as i32 }>(children);
+            Look {
+                closed: _mm256_cmp_ps_mask::<_CMP_LT_OQ>(diagonal2, limit),
+                beyond: beyond | (0xff_u32 << node.count) as u8,
+                leaves: _mm_cmpeq_epi16_mask(kind, _mm_set1_epi16(1)),
+                elsewhere: _mm_cmpgt_epi16_mask(kind, _mm_set1_epi16(1)),
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn order(distance2: &[f32; WIDTH], open: u8, out: &mut [u8; 2 * WIDTH]) {
+        // SAFETY: an array of 8
+        unsafe {
+            let slot = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
+            let distance = _mm256_loadu_si256(distance2.as_ptr().cast());
+            let key = _mm256_or_si256(_mm256_andnot_si256(_mm256_set1_epi32(7), distance), slot);
+            for i in 0..WIDTH {
+                let this = _mm256_permutexvar_epi32(_mm256_set1_epi32(i as i32), key);
+                let farther = _mm256_mask_cmpgt_epi32_mask(open, key, this).count_ones() as usize;
+                // Children that are not open go where nobody looks
+                let closed = usize::from(!open >> i & 1);
+                out[farther | closed * WIDTH] = i as u8;
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn end(alive: &mut [u16; RAYS_MAX / 16], ray: u16) {
+        // SAFETY: the block of 32 words that the ray's bit is in is within the array
+        unsafe {
+            // The whole block is written, so that the next filter's load can be served from the store
+            let block = alive.as_mut_ptr().add(usize::from(ray) / 512 * 32);
+            let words = _mm512_loadu_si512(block.cast());
+            let word = _mm512_maskz_set1_epi16(1 << (ray / 16 % 32), (1_u16 << (ray % 16)) as i16);
+            _mm512_storeu_si512(block.cast(), _mm512_andnot_si512(word, words));
+        }
+    }
+
+    #[inline(always)]
     unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8 {
-        debug_assert!(masks.len() >= ids.len());
-        // SAFETY: ids are below the number of rays; there is a mask for each
+        debug_assert!(masks.len() >= ids.len() + SLACK);
+        // SAFETY: ids are below the number of rays; there is a mask for each, and the slack
         unsafe {
             let mut center = [_mm256_setzero_ps(); 3];
             let mut half = [_mm256_setzero_ps(); 3];
@@ -90,23 +142,23 @@ impl Lanes for Avx512 {
                 half[axis] = _mm256_loadu_ps(boxes.half[axis].as_ptr());
             }
             let mut any = 0;
-            for (i, &id) in ids.iter().enumerate() {
-                let ray = rays.get_unchecked(usize::from(id));
-                let mut enter = _mm256_setzero_ps();
-                let mut leave = _mm256_set1_ps(f32::MAX);
-                for axis in 0..3 {
-                    let inverse = _mm256_broadcast_ss(&ray.inverse[axis]);
-                    let offset = _mm256_broadcast_ss(&ray.offset[axis]);
-                    let middle = _mm256_fmsub_ps(center[axis], inverse, offset);
-                    let steep = absolute(inverse);
-                    enter = _mm256_max_ps(_mm256_fnmadd_ps(half[axis], steep, middle), enter);
-                    leave = _mm256_min_ps(_mm256_fmadd_ps(half[axis], steep, middle), leave);
+            for (i, ids) in ids.chunks(32).enumerate() {
+                // Masks go out in one piece, so that the selections' loads can be served from the store
+                let mut words = [0_u64; 4];
+                for (word, ids) in words.iter_mut().zip(ids.chunks(8)) {
+                    for (i, &id) in ids.iter().enumerate() {
+                        let met = meet_box(rays.get_unchecked(usize::from(id)), &center, &half);
+                        *word |= u64::from(met) << (8 * i);
+                    }
+                    any |= *word;
                 }
-                let met = _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave);
-                *masks.get_unchecked_mut(i) = met;
-                any |= met;
+                let [a, b, c, d] = words;
+                let packed = _mm256_set_epi64x(d as i64, c as i64, b as i64, a as i64);
+                _mm256_storeu_si256(masks.as_mut_ptr().add(32 * i).cast(), packed);
             }
-            any
+            let any = any | any >> 32;
+            let any = any | any >> 16;
+            (any | any >> 8) as u8
         }
     }
 
@@ -182,18 +234,20 @@ impl Lanes for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn planes(source: &Corners, offset: IVec3, out: &mut Planes) {
+    unsafe fn planes(source: &Corners, offset: IVec3, is_near: bool, out: &mut Planes) {
         // SAFETY: arrays of 16
         unsafe {
             // Exclude faces with a corner at the origin, both triangles of them
             let mut corners = [[_mm512_setzero_ps(); 3]; 3];
             let mut touches = 0_u16;
             for (corner, from) in corners.iter_mut().zip(&source.coordinates) {
-                let mut at_origin = u16::MAX;
+                let mut at_origin = if is_near { u16::MAX } else { 0 };
                 for axis in 0..3 {
                     let coordinates = _mm512_loadu_si512(from[axis].as_ptr().cast());
                     let relative = _mm512_sub_epi32(coordinates, _mm512_set1_epi32(offset[axis]));
-                    at_origin = _mm512_mask_testn_epi32_mask(at_origin, relative, relative);
+                    if is_near {
+                        at_origin = _mm512_mask_testn_epi32_mask(at_origin, relative, relative);
+                    }
                     corner[axis] = _mm512_cvtepi32_ps(relative);
                 }
                 touches |= at_origin;
@@ -223,16 +277,38 @@ impl Lanes for Avx512 {
     unsafe fn meet_planes(planes: &Planes, direction: &[f32; 4]) -> u16 {
         // SAFETY: arrays of 16
         unsafe {
-            let d: [__m512; 3] = std::array::from_fn(|axis| _mm512_set1_ps(direction[axis]));
+            let [x, y, z, _] = *direction;
+            let d = [_mm512_set1_ps(x), _mm512_set1_ps(y), _mm512_set1_ps(z)];
             let mut hits = planes.valid;
             for normal in &planes.normals {
-                let n: [__m512; 3] = std::array::from_fn(|axis| _mm512_loadu_ps(normal[axis].as_ptr()));
+                let [x, y, z] = normal;
+                let n =
+                    [_mm512_loadu_ps(x.as_ptr()), _mm512_loadu_ps(y.as_ptr()), _mm512_loadu_ps(z.as_ptr())];
                 let product =
                     _mm512_fmadd_ps(d[2], n[2], _mm512_fmadd_ps(d[1], n[1], _mm512_mul_ps(d[0], n[0])));
                 hits = _mm512_mask_cmp_ps_mask::<_CMP_GE_OQ>(hits, product, _mm512_setzero_ps());
             }
             hits
         }
+    }
+}
+
+/// The boxes that a ray meets.
+#[inline(always)]
+unsafe fn meet_box(ray: &BoxRay, center: &[__m256; 3], half: &[__m256; 3]) -> u8 {
+    // SAFETY: components of the ray are read
+    unsafe {
+        let mut enter = _mm256_setzero_ps();
+        let mut leave = _mm256_set1_ps(f32::MAX);
+        for axis in 0..3 {
+            let inverse = _mm256_broadcast_ss(&ray.inverse[axis]);
+            let offset = _mm256_broadcast_ss(&ray.offset[axis]);
+            let middle = _mm256_fmsub_ps(center[axis], inverse, offset);
+            let steep = absolute(inverse);
+            enter = _mm256_max_ps(_mm256_fnmadd_ps(half[axis], steep, middle), enter);
+            leave = _mm256_min_ps(_mm256_fmadd_ps(half[axis], steep, middle), leave);
+        }
+        _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave)
     }
 }
 

@@ -16,6 +16,9 @@ pub mod plain;
 /// Entries that a lane writes past the end of its output at most.
 pub const SLACK: usize = 32;
 
+/// Relative error of box arithmetic: a few roundings of 2^-24.
+pub const BOX_ERROR: f32 = 1.0 / (1 << 21) as f32;
+
 /// The boxes of a node's children relative to a bundle's reference, in lattice steps.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
@@ -28,6 +31,19 @@ pub struct Boxes {
     pub distance2: [f32; WIDTH],
     /// Squared diagonal.
     pub diagonal2: [f32; WIDTH],
+}
+
+/// What a bundle makes of a node's children, one bit each.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Look {
+    /// So small and far that their far field stands in for them.
+    pub closed: u8,
+    /// Out of the rays' reach, or not there.
+    pub beyond: u8,
+    /// Leaves.
+    pub leaves: u8,
+    /// Neither leaves nor nodes of the same brick.
+    pub elsewhere: u8,
 }
 
 /// Corners of a leaf's triangles relative to a bundle's reference, in lattice steps: lanes 0 to 7 have the first triangles of
@@ -73,17 +89,37 @@ impl Planes {
 /// must be below the lengths of the slices they index.
 pub trait Lanes {
     /// Writes those of `ids` that are alive to `out`, in order, and returns how many. `out` is at least
-    /// `ids.len() + SLACK` long.
+    /// `ids.len() + SLACK` long, and `alive` has whole blocks of 64 words up to the last ray's.
     ///
     /// # Safety
     /// See the trait.
-    unsafe fn filter(alive: &[u16; RAYS_MAX / 16], ids: &[u16], out: &mut [u16]) -> usize;
+    unsafe fn filter(alive: &[u16], ids: &[u16], out: &mut [u16]) -> usize;
 
     /// Decodes a node's boxes relative to `reference`; `origins` is the box of the origins, likewise.
     ///
     /// # Safety
     /// See the trait.
     unsafe fn boxes(node: &Node, reference: IVec3, origins: &[glam::Vec3; 2], out: &mut Boxes);
+
+    /// Looks at a node's decoded children: those whose squared diagonal is below `open2` times their squared distance are
+    /// closed, those of a squared distance above `reach2` beyond.
+    ///
+    /// # Safety
+    /// See the trait.
+    unsafe fn look(node: &Node, boxes: &Boxes, open2: f32, reach2: f32) -> Look;
+
+    /// Writes the children in `open` to `out`, far ones first; further entries are of no meaning. Distances that differ in
+    /// the last three bits only count as equal, and then the later child comes first.
+    ///
+    /// # Safety
+    /// See the trait.
+    unsafe fn order(distance2: &[f32; WIDTH], open: u8, out: &mut [u8; 2 * WIDTH]);
+
+    /// Ends a ray: takes it from those that are alive.
+    ///
+    /// # Safety
+    /// See the trait.
+    unsafe fn end(alive: &mut [u16; RAYS_MAX / 16], ray: u16);
 
     /// Writes to `masks`, for each of `ids`, the boxes that its ray meets, one bit a box, and returns the boxes that any
     /// meets. `masks` is at least `ids.len() + SLACK` long.
@@ -107,11 +143,11 @@ pub trait Lanes {
     unsafe fn corners(leaf: &[u8], layout: &Layout, reference: IVec3, out: &mut Corners);
 
     /// Turns triangles into planes as seen from an origin, which lies at `offset` from the reference. Faces with a corner at
-    /// the origin are left out.
+    /// the origin are left out; only if `is_near` may there be any.
     ///
     /// # Safety
     /// See the trait.
-    unsafe fn planes(corners: &Corners, offset: IVec3, out: &mut Planes);
+    unsafe fn planes(corners: &Corners, offset: IVec3, is_near: bool, out: &mut Planes);
 
     /// The triangles that a ray meets, one bit a lane.
     ///

@@ -2,21 +2,18 @@
 
 use glam::{IVec3, Vec3};
 
-use super::{Boxes, Corners, Lanes, Planes};
+use super::{BOX_ERROR, Boxes, Corners, Lanes, Look, Planes};
 use crate::brick::bundle::{BoxRay, RAYS_MAX};
 use crate::brick::leaf::{FACES_MAX, Kind, Layout, VERTICES_MAX};
-use crate::brick::node::{Node, WIDTH};
+use crate::brick::node::{LOCATION_BITS, Node, WIDTH};
 
 /// The plain loops.
 #[derive(Clone, Copy, Debug)]
 pub struct Plain;
 
-/// Relative error of box arithmetic: a few roundings of 2^-24.
-pub const BOX_ERROR: f32 = 1.0 / (1 << 21) as f32;
-
 impl Lanes for Plain {
     #[inline(always)]
-    unsafe fn filter(alive: &[u16; RAYS_MAX / 16], ids: &[u16], out: &mut [u16]) -> usize {
+    unsafe fn filter(alive: &[u16], ids: &[u16], out: &mut [u16]) -> usize {
         let mut count = 0;
         for &id in ids {
             out[count] = id;
@@ -48,6 +45,34 @@ impl Lanes for Plain {
             }
         }
         (out.distance2, out.diagonal2) = (distance2, diagonal2);
+    }
+
+    #[inline(always)]
+    unsafe fn look(node: &Node, boxes: &Boxes, open2: f32, reach2: f32) -> Look {
+        let mut look = Look { beyond: (0xff_u32 << node.count) as u8, ..Look::default() };
+        for slot in 0..WIDTH {
+            let kind = node.children[slot] >> LOCATION_BITS;
+            look.closed |= u8::from(boxes.diagonal2[slot] < open2 * boxes.distance2[slot]) << slot;
+            look.beyond |= u8::from(boxes.distance2[slot] > reach2) << slot;
+            look.leaves |= u8::from(kind == 1) << slot;
+            look.elsewhere |= u8::from(kind > 1) << slot;
+        }
+        look
+    }
+
+    #[inline(always)]
+    unsafe fn order(distance2: &[f32; WIDTH], open: u8, out: &mut [u8; 2 * WIDTH]) {
+        // Squared distances are not negative: their bits are in their order
+        let key = |slot: usize| distance2[slot].to_bits() & !7 | slot as u32;
+        for slot in (0..WIDTH).filter(|slot| open >> slot & 1 != 0) {
+            let farther = (0..WIDTH).filter(|&other| open >> other & 1 != 0 && key(other) > key(slot));
+            out[farther.count()] = slot as u8;
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn end(alive: &mut [u16; RAYS_MAX / 16], ray: u16) {
+        alive[usize::from(ray) / 16] &= !(1 << (ray % 16));
     }
 
     #[inline(always)]
@@ -117,11 +142,11 @@ impl Lanes for Plain {
     }
 
     #[inline(always)]
-    unsafe fn planes(source: &Corners, offset: IVec3, out: &mut Planes) {
+    unsafe fn planes(source: &Corners, offset: IVec3, is_near: bool, out: &mut Planes) {
         let mut corners = [[[0.0_f32; 16]; 3]; 3];
         let mut touches = 0_u16;
         for (corner, from) in corners.iter_mut().zip(&source.coordinates) {
-            let mut at_origin = u16::MAX;
+            let mut at_origin = if is_near { u16::MAX } else { 0 };
             for axis in 0..3 {
                 for lane in 0..16 {
                     let relative = from[axis][lane].wrapping_sub(offset[axis]);

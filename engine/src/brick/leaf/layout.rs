@@ -100,7 +100,7 @@ impl Layout {
     /// [`read`](Self::read) for a leaf that was checked when its brick was loaded.
     #[inline(always)]
     pub fn read_trusted(leaf: &[u8], corner: IVec3) -> Self {
-        let header = u32::from_le_bytes(leaf[..4].try_into().expect("4 bytes"));
+        let header = u32::from_le_bytes([leaf[0], leaf[1], leaf[2], leaf[3]]);
         let field = |bit: u32, bits: u32| header >> bit & ((1 << bits) - 1);
         let kind = Kind::from_bits(header >> 28);
         let (first, second) = (field(0, 3) as usize + 1, field(3, 5) as usize + 1);
@@ -110,15 +110,16 @@ impl Layout {
             _ => (first, second, 0),
         };
         let shift = field(8, 5);
-        let bits = [13, 18, 23].map(|bit| field(bit, 5) as u8);
+        let bits = [field(13, 5) as u8, field(18, 5) as u8, field(23, 5) as u8];
         let index_bits = 4 + usize::from(vertices > 16);
         let index_bytes = (faces * index_bits).div_ceil(8);
         let mut at = HEADER_BYTES + kind.corners() * index_bytes;
-        let coordinates = bits.map(|bits| {
-            let here = at;
+        // A loop, since a closure would be a call where the walk has vector instructions enabled
+        let mut coordinates = [0; 3];
+        for (coordinates, &bits) in coordinates.iter_mut().zip(&bits) {
+            *coordinates = at;
             at += (vertices * usize::from(bits)).div_ceil(8);
-            here
-        });
+        }
         let extinctions = at;
         let opaque = field(30, 1) == 0;
         at += if opaque { 0 } else { 2 * faces };

@@ -27,12 +27,16 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
             self.scratch.counts.far_hits += met as u64;
             let (record, half) = (&node.far[slot], node.child_half(slot));
             match far::kind(record) {
-                far::Kind::Single | far::Kind::Layered => self.meet_aggregate(record, half, met),
-                far::Kind::Plate => self.meet_plate(record, half, slot, met),
+                // SAFETY: as the caller's
+                far::Kind::Single | far::Kind::Layered => unsafe { self.meet_aggregate(record, half, met) },
+                // SAFETY: as the caller's
+                far::Kind::Plate => unsafe { self.meet_plate(record, half, slot, met) },
                 far::Kind::Scalar => {
                     let extinction = face_extinction(u16::from_le_bytes([record[0], record[1]]));
-                    for &ray in &self.scratch.far[..met] {
-                        self.bundle.extinguish(ray, extinction);
+                    for i in 0..met {
+                        let ray = self.scratch.far[i];
+                        // SAFETY: as the caller's
+                        unsafe { self.extinguish(ray, extinction) };
                     }
                 }
             }
@@ -40,18 +44,27 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
     }
 
     /// Adds an aggregate's extinction to the first `met` rays of the list.
+    ///
+    /// # Safety
+    /// The instruction set of `L` is available.
     #[inline(always)]
-    fn meet_aggregate(&mut self, record: &far::Record, half: Vec3, met: usize) {
+    unsafe fn meet_aggregate(&mut self, record: &far::Record, half: Vec3, met: usize) {
         let aggregate = Aggregate::decode(record);
-        for &ray in &self.scratch.far[..met] {
+        for i in 0..met {
+            let ray = self.scratch.far[i];
             let direction = Vec3::from_slice(&self.bundle.directions[usize::from(ray)][..3]);
-            self.bundle.extinguish(ray, aggregate.extinction(direction, half));
+            let extinction = aggregate.extinction(direction, half);
+            // SAFETY: as the caller's
+            unsafe { self.extinguish(ray, extinction) };
         }
     }
 
     /// Ends those of the first `met` rays of the list that meet a plate.
+    ///
+    /// # Safety
+    /// The instruction set of `L` is available.
     #[inline(never)]
-    fn meet_plate(&mut self, record: &far::Record, half: Vec3, slot: usize, met: usize) {
+    unsafe fn meet_plate(&mut self, record: &far::Record, half: Vec3, slot: usize, met: usize) {
         let plate = Plate::decode(record, half);
         let center = Vec3::from_array(self.scratch.boxes.center.map(|center| center[slot]));
         let mut at = 0;
@@ -64,7 +77,8 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
                 let direction = Vec3::from_slice(&self.bundle.directions[usize::from(ray)][..3]);
                 let (enter, leave) = far::pass(direction, &bounds);
                 if plate.is_met(direction, &bounds, enter, leave) {
-                    self.bundle.extinguish(ray, EXTINCTION_OPAQUE);
+                    // SAFETY: as the caller's
+                    unsafe { self.extinguish(ray, EXTINCTION_OPAQUE) };
                 }
                 at += 1;
             }

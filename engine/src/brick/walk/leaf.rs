@@ -4,7 +4,7 @@ use glam::Vec3;
 
 use super::super::bundle::EXTINCTION_OPAQUE;
 use super::super::intersect;
-use super::super::lanes::{Lanes, within};
+use super::super::lanes::{BOX_ERROR, Lanes, within};
 use super::super::leaf::{self, Kind, Layout};
 use super::super::node::LOCATION_BYTES;
 use super::Bricks;
@@ -25,63 +25,77 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
         self.scratch.counts.leaves += 1;
         self.scratch.counts.leaf_rays += count as u64;
         if layout.kind == Kind::Round {
-            self.visit_round_leaf(bytes, &layout, count);
+            // SAFETY: as the caller's
+            unsafe { self.visit_round_leaf(bytes, &layout, count) };
             return;
         }
         // SAFETY: the brick was checked when it was loaded, and memory runs on past it
         unsafe { L::corners(bytes, &layout, self.bundle.reference, &mut self.scratch.corners) };
-        // Rays are in order: each origin's are a run
-        let mut at = 0;
-        for origin in 0..self.bundle.origins.len() {
-            let origin = self.bundle.origins[origin];
-            let start = at;
-            while at < count && self.scratch.current[at] < origin.end {
-                at += 1;
-            }
-            if at == start {
-                continue;
-            }
-            let offset = origin.position.wrapping_sub(self.bundle.reference);
-            let Scratch { corners, planes, .. } = &mut *self.scratch;
-            // SAFETY: as the caller's
-            unsafe { L::planes(corners, offset, planes) };
-            if self.scratch.planes.valid == 0 {
-                continue;
-            }
-            let near = self.bundle.near > 0.0 && self.is_near(&layout, origin.position);
-            for i in start..at {
-                let ray = self.scratch.current[i];
-                let direction = self.bundle.directions[usize::from(ray)];
+        let is_near = self.is_near(&layout);
+        let again = is_near || self.bundle.reach.is_finite();
+
+        // Test the rays, which are in the order of their origins, and keep those that meet faces
+        let (mut origin, mut end) = (0, 0);
+        let mut met = 0;
+        for i in 0..count {
+            let ray = self.scratch.current[i];
+            if ray >= end {
+                while ray >= self.bundle.origins[origin].end {
+                    origin += 1;
+                }
+                end = self.bundle.origins[origin].end;
+                let offset = self.bundle.origins[origin].position.wrapping_sub(self.bundle.reference);
+                let Scratch { corners, planes, .. } = &mut *self.scratch;
                 // SAFETY: as the caller's
-                let mut hits = unsafe { L::meet_planes(&self.scratch.planes, &direction) };
-                if hits == 0 {
-                    continue;
-                }
-                if self.bundle.reach.is_finite() {
-                    hits = within(&self.scratch.planes, &direction, hits, self.bundle.reach);
-                }
-                let mut faces = layout.kind.faces(hits);
-                if near && faces != 0 {
-                    faces = self.retest(bytes, &layout, &origin, &direction, hits);
-                }
-                if faces != 0 {
-                    self.meet_faces(bytes, &layout, ray, faces);
-                }
+                unsafe { L::planes(corners, offset, is_near, planes) };
             }
+            let direction = &self.bundle.directions[usize::from(ray)];
+            // SAFETY: as the caller's
+            let hits = unsafe { L::meet_planes(&self.scratch.planes, direction) };
+            let faces = if again && hits != 0 {
+                self.look_again(bytes, &layout, origin, ray, hits)
+            } else {
+                layout.kind.faces(hits)
+            };
+            self.scratch.met[met] = (ray, faces);
+            met += usize::from(faces != 0);
+        }
+
+        // Add up what they met
+        for i in 0..met {
+            let (ray, faces) = self.scratch.met[i];
+            // SAFETY: as the caller's
+            unsafe { self.meet_faces(bytes, &layout, ray, faces) };
         }
     }
 
-    /// Whether the leaf's vertices may lie within the near distance of an origin.
-    #[inline(always)]
-    fn is_near(&self, layout: &Layout, origin: glam::IVec3) -> bool {
-        let mut gap2 = 0.0;
-        for axis in 0..3 {
-            let lower = layout.origin[axis].wrapping_sub(origin[axis]) as f32;
-            let extent = ((1_u64 << layout.bits[axis]) << layout.shift) as f32;
-            let gap = lower.max(-(lower + extent)).max(0.0);
-            gap2 += gap * gap;
+    /// The faces of `hits` that a ray meets within its reach; those that are near are tested again in double precision.
+    #[inline(never)]
+    fn look_again(&mut self, leaf: &[u8], layout: &Layout, origin: usize, ray: u16, mut hits: u16) -> u16 {
+        let direction = self.bundle.directions[usize::from(ray)];
+        if self.bundle.reach.is_finite() {
+            hits = within(&self.scratch.planes, &direction, hits, self.bundle.reach);
         }
-        let near = self.bundle.near * self.bundle.stretch;
+        if self.bundle.near == 0.0 || hits == 0 {
+            return layout.kind.faces(hits);
+        }
+        let origin = self.bundle.origins[origin];
+        self.retest(leaf, layout, &origin, &direction, hits)
+    }
+
+    /// Whether the leaf's vertices may lie within the near distance of an origin, or touch one.
+    #[inline(always)]
+    fn is_near(&self, layout: &Layout) -> bool {
+        let (bounds, mut gap2, mut size) = (&self.bundle.bounds, 0.0, 0.0);
+        for axis in 0..3 {
+            let lower = layout.origin[axis].wrapping_sub(self.bundle.reference[axis]) as f32;
+            let upper = lower + ((1_u64 << layout.bits[axis]) << layout.shift) as f32;
+            let gap = (lower - bounds[1][axis]).max(bounds[0][axis] - upper).max(0.0);
+            gap2 += gap * gap;
+            size += lower.abs() + upper.abs();
+        }
+        // Differences are rounded
+        let near = self.bundle.near * self.bundle.stretch + BOX_ERROR * size;
         gap2 <= near * near
     }
 
@@ -110,8 +124,11 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
     }
 
     /// Points and lines: few, and tested in double precision.
+    ///
+    /// # Safety
+    /// The instruction set of `L` is available.
     #[inline(never)]
-    fn visit_round_leaf(&mut self, leaf: &[u8], layout: &Layout, count: usize) {
+    unsafe fn visit_round_leaf(&mut self, leaf: &[u8], layout: &Layout, count: usize) {
         let reach = f64::from(self.bundle.reach);
         let decoded: [_; leaf::FACES_MAX] =
             std::array::from_fn(|face| layout.face(leaf, face.min(layout.faces - 1)));
@@ -131,14 +148,30 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
                 faces |= u16::from(intersect::meets(decoded, position, direction, reach)) << face;
             }
             if faces != 0 {
-                self.meet_faces(leaf, layout, ray, faces);
+                // SAFETY: as the caller's
+                unsafe { self.meet_faces(leaf, layout, ray, faces) };
             }
         }
     }
 
-    /// Adds the extinction of the faces in the mask to a ray.
+    /// Adds extinction to a ray and ends it if that passes its limit.
+    ///
+    /// # Safety
+    /// The instruction set of `L` is available.
     #[inline(always)]
-    fn meet_faces(&mut self, leaf: &[u8], layout: &Layout, ray: u16, mut faces: u16) {
+    pub(super) unsafe fn extinguish(&mut self, ray: u16, extinction: u32) {
+        if self.bundle.add(ray, extinction) {
+            // SAFETY: rays in lists are the bundle's
+            unsafe { L::end(&mut self.bundle.alive, ray) };
+        }
+    }
+
+    /// Adds the extinction of the faces in the mask to a ray.
+    ///
+    /// # Safety
+    /// The instruction set of `L` is available.
+    #[inline(always)]
+    unsafe fn meet_faces(&mut self, leaf: &[u8], layout: &Layout, ray: u16, mut faces: u16) {
         self.scratch.counts.hits += u64::from(faces.count_ones());
         let mut extinction = 0;
         if layout.opaque {
@@ -149,7 +182,8 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
                 faces &= faces - 1;
             }
         }
-        self.bundle.extinguish(ray, extinction);
+        // SAFETY: as the caller's
+        unsafe { self.extinguish(ray, extinction) };
     }
 }
 

@@ -3,7 +3,7 @@
 use super::super::ALIGNMENT;
 use super::super::bundle::Bundle;
 use super::super::far;
-use super::super::lanes::{Lanes, SLACK};
+use super::super::lanes::{Lanes, Look, SLACK};
 use super::super::node::{Child, LOCATION_BITS, LOCATION_BYTES, Node, WIDTH};
 use super::super::{HEADER_BYTES, bundle::RAYS_MAX};
 use super::instances::{Entrance, instance_at};
@@ -51,6 +51,7 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             lanes: std::marker::PhantomData,
         };
         walk.scratch.stack.clear();
+        let words = walk.bundle.len().div_ceil(16).next_multiple_of(64);
         let count = rays.len();
         match bricks.locate(start.brick) {
             Location::Resident(at) => {
@@ -77,8 +78,9 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             }
             let scratch = &mut *walk.scratch;
             // SAFETY: `current` has room for all rays of a bundle and the slack
-            let count =
-                unsafe { L::filter(&walk.bundle.alive, &scratch.lists[first..end], &mut scratch.current) };
+            let count = unsafe {
+                L::filter(&walk.bundle.alive[..words], &scratch.lists[first..end], &mut scratch.current)
+            };
             if count == 0 {
                 continue;
             }
@@ -105,23 +107,23 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         self.scratch.counts.node_rays += count as u64;
         let Scratch { current, masks, boxes, .. } = &mut *self.scratch;
 
+        // Ask for all children before the rays are tested; places that are not in use are the node itself
+        let mut children = [0; WIDTH];
+        for (child, &stored) in children.iter_mut().zip(&node.children) {
+            *child = entry.address + LOCATION_BYTES * usize::from(stored & LOCATION_MASK);
+            prefetch(self.memory, *child);
+        }
+
         // Decode the boxes, and see what is to be opened
-        // SAFETY: as the caller's
-        unsafe { L::boxes(node, self.bundle.reference, &self.bundle.bounds, boxes) };
-        let mut far_mask = 0_u8;
-        let mut beyond = (0xff_u32 << node.count) as u8;
         let reach = self.bundle.reach * self.bundle.stretch;
-        let reach2 = reach * reach;
-        for slot in 0..usize::from(node.count) {
-            if boxes.diagonal2[slot] < self.open2 * boxes.distance2[slot] && !far::must_open(&node.far[slot])
-            {
-                far_mask |= 1 << slot;
-            }
-            beyond |= u8::from(boxes.distance2[slot] > reach2) << slot;
-            // A node, leaf or instance that will be visited is asked for before the rays are tested
-            let child = node.children[slot];
-            if child >> LOCATION_BITS != 2 {
-                prefetch(self.memory, entry.address + LOCATION_BYTES * usize::from(child & LOCATION_MASK));
+        // SAFETY: as the caller's
+        let Look { mut closed, beyond, leaves, elsewhere } = unsafe {
+            L::boxes(node, self.bundle.reference, &self.bundle.bounds, boxes);
+            L::look(node, boxes, self.open2, reach * reach)
+        };
+        if closed != 0 {
+            for (slot, record) in node.far.iter().enumerate() {
+                closed &= !(u8::from(far::must_open(record)) << slot);
             }
         }
 
@@ -129,119 +131,116 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         // SAFETY: ray numbers in lists are below the bundle's length; `masks` has the slack
         let met = unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) } & !beyond;
 
-        // Order the children to open, far ones first, so that near ones are visited first
-        let mut order = [0_u64; WIDTH];
-        let mut targets = [Target::FarField; WIDTH];
-        let mut opened = 0;
-        let mut rest = met & !far_mask;
+        // Look up what lies elsewhere
+        let (mut instances, mut missing) = (0_u8, 0_u8);
+        let mut rest = met & !closed & elsewhere;
         while rest != 0 {
             let slot = rest.trailing_zeros() as usize;
             rest &= rest - 1;
-            targets[slot] = self.target(entry.address, slot);
-            if targets[slot] == Target::FarField {
-                far_mask |= 1 << slot;
-                continue;
+            match self.target(entry.address, slot) {
+                Target::Node(address) => children[slot] = address,
+                Target::Instance => instances |= 1 << slot,
+                Target::FarField => closed |= 1 << slot,
+                Target::Wait => missing |= 1 << slot,
             }
-            // Squared distances are not negative: their bits are in their order
-            let key = u64::from(self.scratch.boxes.distance2[slot].to_bits()) << 8 | slot as u64;
-            let mut at = opened;
-            while at > 0 && order[at - 1] < key {
-                order[at] = order[at - 1];
-                at -= 1;
-            }
-            order[at] = key;
-            opened += 1;
         }
-        if met & far_mask != 0 {
+        if met & closed != 0 {
             // SAFETY: as the caller's
-            unsafe { self.meet_far_fields(node, met & far_mask, count) };
+            unsafe { self.meet_far_fields(node, met & closed, count) };
         }
+
+        // Put the others on the stack, far ones first, so that near ones are visited first
+        let open = met & !closed;
+        let mut order = [0; 2 * WIDTH];
+        // SAFETY: as the caller's
+        unsafe { L::order(&self.scratch.boxes.distance2, open, &mut order) };
         let mut first = entry.first as usize;
-        for &key in &order[..opened] {
-            let slot = key as usize & 7;
+        if self.scratch.lists.len() < first + WIDTH * count + SLACK {
+            let longer = 2 * self.scratch.lists.len() + WIDTH * RAYS_MAX;
+            self.scratch.lists.resize(longer, 0);
+        }
+        for &slot in &order[..open.count_ones() as usize] {
+            let slot = usize::from(slot) % WIDTH;
             let Scratch { current, masks, lists, stack, .. } = &mut *self.scratch;
-            if lists.len() < first + count + SLACK {
-                lists.resize(2 * lists.len() + RAYS_MAX, 0);
-            }
             // SAFETY: the list has just been made long enough
             let met = unsafe { L::select(&current[..count], masks, slot, &mut lists[first..]) };
-            if met == 0 {
+            if missing >> slot & 1 != 0 {
+                self.wait(entry.address, slot, first..first + met);
                 continue;
             }
-            match targets[slot] {
-                Target::Node(address) => {
-                    prefetch(self.memory, address);
-                    stack.push(Entry { address, leaf: NO_LEAF, count: met as u16, first: first as u32 });
-                    first += met;
-                }
-                Target::Leaf => {
-                    let (address, leaf) = (entry.address, slot as u16);
-                    stack.push(Entry { address, leaf, count: met as u16, first: first as u32 });
-                    first += met;
-                }
-                Target::Instance => {
-                    let (address, leaf) = (entry.address, slot as u16 | INSTANCE);
-                    stack.push(Entry { address, leaf, count: met as u16, first: first as u32 });
-                    first += met;
-                }
-                Target::Wait(brick) => {
-                    let start = self.start(brick, entry.address, slot);
-                    let scratch = &mut *self.scratch;
-                    let begin = scratch.waiting_rays.len() as u32;
-                    scratch.waiting_rays.extend_from_slice(&scratch.lists[first..first + met]);
-                    scratch.waiting.push(Waiting { start, first: begin, count: met as u32 });
-                }
-                Target::FarField => {}
-            }
+            let is_instance = instances >> slot & 1 != 0;
+            let stays = (leaves | instances) >> slot & 1 != 0;
+            let leaf = slot as u16 | if is_instance { INSTANCE } else { 0 };
+            stack.push(Entry {
+                address: if stays { entry.address } else { children[slot] },
+                leaf: if stays { leaf } else { NO_LEAF },
+                count: met as u16,
+                first: first as u32,
+            });
+            first += met;
         }
     }
 
-    /// What a child of the node at `address` asks for.
+    /// Lets the rays in a range of the lists wait for the brick that a child of the node at `address` refers to.
+    #[inline(never)]
+    fn wait(&mut self, address: usize, slot: usize, rays: std::ops::Range<usize>) {
+        let child = node_at(self.memory, address).children[slot];
+        let brick = match Child::decode(child) {
+            Child::Instance(_) => instance_at(self.memory, address, child).brick,
+            _ => self.brick_number(address + LOCATION_BYTES * usize::from(child & LOCATION_MASK)),
+        };
+        let start = self.start(brick, address, slot);
+        let scratch = &mut *self.scratch;
+        let (first, count) = (scratch.waiting_rays.len() as u32, rays.len() as u32);
+        scratch.waiting_rays.extend_from_slice(&scratch.lists[rays]);
+        scratch.waiting.push(Waiting { start, first, count });
+    }
+
+    /// What a child of the node at `address` asks for that is neither a leaf nor a node of the same brick.
     #[inline(always)]
     fn target(&self, address: usize, slot: usize) -> Target {
         let child = node_at(self.memory, address).children[slot];
-        match Child::decode(child) {
-            Child::Node(offset) => Target::Node(address + LOCATION_BYTES * usize::from(offset)),
-            Child::Leaf(_) => Target::Leaf,
-            Child::Brick(offset) => {
-                let at = address + LOCATION_BYTES * usize::from(offset);
-                let number = u32::from_le_bytes(self.memory[at..at + 4].try_into().expect("4 bytes"));
-                match self.bricks.locate(number) {
-                    Location::Resident(at) => Target::Node(root_node(at)),
-                    Location::FarField => Target::FarField,
-                    Location::Missing => Target::Wait(number),
-                }
+        if let Child::Instance(_) = Child::decode(child) {
+            let instance = instance_at(self.memory, address, child);
+            if self.entrance.is_some() || !instance.is_within_reach(self.scratch.boxes.distance2[slot]) {
+                return Target::FarField;
             }
-            Child::Instance(_) => {
-                let instance = instance_at(self.memory, address, child);
-                let distance2 = self.scratch.boxes.distance2[slot];
-                match self.bricks.locate(instance.brick) {
-                    _ if self.entrance.is_some() || !instance.is_within_reach(distance2) => Target::FarField,
-                    Location::Resident(at) => {
-                        prefetch(self.memory, root_node(at));
-                        Target::Instance
-                    }
-                    Location::FarField => Target::FarField,
-                    Location::Missing => Target::Wait(instance.brick),
+            return match self.bricks.locate(instance.brick) {
+                Location::Resident(at) => {
+                    prefetch(self.memory, root_node(at));
+                    Target::Instance
                 }
-            }
+                Location::FarField => Target::FarField,
+                Location::Missing => Target::Wait,
+            };
         }
+        let number = self.brick_number(address + LOCATION_BYTES * usize::from(child & LOCATION_MASK));
+        match self.bricks.locate(number) {
+            Location::Resident(at) => Target::Node(root_node(at)),
+            Location::FarField => Target::FarField,
+            Location::Missing => Target::Wait,
+        }
+    }
+
+    /// The brick's number at a place in a brick's table.
+    #[inline(always)]
+    fn brick_number(&self, at: usize) -> u32 {
+        let bytes = &self.memory[at..at + 4];
+        u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])
     }
 }
 
-/// What becomes of a child.
+/// What becomes of a child that lies elsewhere.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Target {
     /// Its far field stands in for it.
     FarField,
     /// It is a node to visit, at this byte address.
     Node(usize),
-    /// It is a leaf to visit.
-    Leaf,
     /// It is an instance to enter.
     Instance,
-    /// It is a brick that is not in memory.
-    Wait(u32),
+    /// It is not in memory.
+    Wait,
 }
 
 /// The byte address of a brick's root node, from the brick's in units of [`ALIGNMENT`].

@@ -61,6 +61,8 @@ pub struct Scratch {
     pub(super) current: Vec<u16>,
     pub(super) far: Vec<u16>,
     pub(super) masks: Vec<u8>,
+    /// Rays that meet faces of the leaf being visited, and the faces.
+    pub(super) met: Vec<(u16, u16)>,
     pub(super) boxes: Boxes,
     pub(super) corners: Corners,
     pub(super) planes: Planes,
@@ -103,6 +105,7 @@ impl Scratch {
             current: vec![0; RAYS_MAX + SLACK],
             far: vec![0; RAYS_MAX + SLACK],
             masks: vec![0; RAYS_MAX + 2 * SLACK],
+            met: vec![(0, 0); RAYS_MAX + 1],
             boxes: Boxes {
                 center: [[0.0; WIDTH]; 3],
                 half: [[0.0; WIDTH]; 3],
