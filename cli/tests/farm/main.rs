@@ -71,12 +71,10 @@ fn a_coordinator_may_be_killed_and_started_again() {
     let mut farm = Farm::start();
     farm.worker("first");
     let job = farm.submit(6);
-    for done in [1, 4] {
-        farm.until_baking(&job, done);
-        farm.kill_coordinator();
-        std::thread::sleep(Duration::from_secs(2));
-        farm.start_coordinator();
-    }
+    farm.until_baking(&job, 1);
+    farm.kill_coordinator();
+    std::thread::sleep(Duration::from_secs(2));
+    farm.start_coordinator();
     farm.wait(&job);
     farm.expect(&job, 6);
 }
