@@ -1,7 +1,7 @@
 //! A bundle: all rays of one or a few neighbouring points, which pass through the bricks together.
 //!
 //! Rays are known by 16-bit numbers. Everything is in lattice steps relative to the bundle's reference point, so
-//! that single precision is exact where it matters: near the origins. Inside an [instance](super::instance) the same
+//! that single precision is exact where it matters: near the origins. Inside an [instance] the same
 //! numbers stand for the same rays on the prototype's lattice ([`Inside`]).
 
 use glam::{DVec3, IVec3, Vec3};

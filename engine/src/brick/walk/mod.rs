@@ -25,7 +25,7 @@ use nodes::Walk;
 /// Where a brick is, for the current batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Location {
-    /// In memory, at a multiple of [`ALIGNMENT`] bytes.
+    /// In memory, at a multiple of [`ALIGNMENT`](super::ALIGNMENT) bytes.
     Resident(u32),
     /// Not in the batch's cut: its far field stands in for it.
     FarField,
@@ -35,7 +35,7 @@ pub enum Location {
 
 /// The bricks that a walk may visit.
 pub trait Bricks {
-    /// The memory that holds the resident bricks, all checked, with [`leaf::READ_PAST_BYTES`] to spare at the end.
+    /// The memory that holds the resident bricks, all checked, with [`READ_PAST_BYTES`](super::leaf::READ_PAST_BYTES) to spare at the end.
     fn memory(&self) -> &[u8];
     /// Where a brick is.
     fn locate(&self, brick: u32) -> Location;
