@@ -260,7 +260,7 @@ impl Filler<'_> {
         let mut hits = Hits::NONE;
         // SAFETY: the caller's
         unsafe { self.shooter.shoot::<K, false>(self.grove, target, &self.lines, self.lines.all, &mut hits) };
-        for i in 0..directions.count {
+        for i in 0..directions.count.min(LINES_MAX) {
             self.lost[i] = 1.0 - hits.passed[i];
         }
         fit::covered(&moments, &self.lines, &mut self.covered);
@@ -434,15 +434,20 @@ impl Filler<'_> {
         let middle = normal.dot(corner + half);
         slab(&self.lines, normal, middle, low, high, &mut self.slab);
         let mut judges = 0;
-        for i in 0..LINES_MAX {
-            let meets = self.slab[0][i] <= self.lines.leave[i] && self.slab[1][i] >= 0.0;
-            judges |= u64::from(meets) << i;
+        for first in (0..LINES_MAX).step_by(16) {
+            let mut bits = 0_u16;
+            for lane in 0..16 {
+                let i = first + lane;
+                bits |= u16::from(self.slab[0][i] <= self.lines.leave[i] && self.slab[1][i] >= 0.0) << lane;
+            }
+            judges |= u64::from(bits) << first;
         }
         let wider = margin * normal.length();
         slab(&self.lines, normal, middle, low - wider, high + wider, &mut self.slab);
         for i in 0..LINES_MAX {
-            self.lines.from[i] = self.slab[0][i].max(-margin);
-            self.lines.to[i] = self.slab[1][i].min(self.lines.leave[i] + margin);
+            let (from, to, leave) = (self.slab[0][i], self.slab[1][i], self.lines.leave[i] + margin);
+            self.lines.from[i] = if from > -margin { from } else { -margin };
+            self.lines.to[i] = if to < leave { to } else { leave };
         }
         judges
     }

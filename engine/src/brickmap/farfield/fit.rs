@@ -2,12 +2,15 @@
 
 use glam::Vec3;
 
-use super::lines::{Column, Lines};
+use super::lines::{Column, LINES_MAX, Lines};
 use super::moments::Moments;
 use crate::brick::far::{Aggregate, Record};
 
 /// Newton steps. The curve is concave and the start below it, so every step stays below.
 const STEPS: usize = 6;
+
+/// A step that changes the factor by less than this share is the last: the record's codes are coarser.
+const ACCURACY: f32 = 1.0 / 512.0;
 
 /// Columns are summed up in this many parts, one an element of a vector.
 const LANES: usize = 16;
@@ -17,7 +20,7 @@ const LANES: usize = 16;
 pub fn covered(moments: &Moments, lines: &Lines<'_>, out: &mut Column) {
     let [xx, yy, zz, xy, yz, xz] = moments.shown();
     let [dx, dy, dz] = &lines.directions.along;
-    for i in 0..lines.directions.count {
+    for i in 0..lines.directions.count.min(LINES_MAX) {
         let (x, y, z) = (dx[i], dy[i], dz[i]);
         let square = (xx * x * x + yy * y * y + zz * z * z) + 2.0 * (xy * x * y + yz * y * z + xz * x * z);
         let positive = if square > 0.0 { square } else { 0.0 };
@@ -29,9 +32,10 @@ pub fn covered(moments: &Moments, lines: &Lines<'_>, out: &mut Column) {
 #[inline(always)]
 pub fn sum(count: usize, f: impl Fn(usize) -> f32) -> f32 {
     let mut parts = [0.0_f32; LANES];
-    for first in (0..count).step_by(LANES) {
-        for (lane, part) in parts.iter_mut().enumerate() {
-            *part += f(first + lane);
+    // Bounded, so that no index is checked and the loops become vectors
+    for chunk in 0..(count / LANES).min(LINES_MAX / LANES) {
+        for lane in 0..LANES {
+            parts[lane] += f(LANES * chunk + lane);
         }
     }
     let mut width = LANES / 2;
@@ -57,6 +61,17 @@ fn layered(x: f32) -> (f32, f32) {
     (1.0 - fourth * fourth, fourth * square * rest)
 }
 
+#[inline(always)]
+fn square(x: f32) -> f32 {
+    x * x
+}
+
+/// A Newton step towards what is `missing`, never back.
+#[inline(always)]
+fn step(missing: f32, slope: f32) -> f32 {
+    if slope > 0.0 && missing > 0.0 { missing / slope } else { 0.0 }
+}
+
 /// The record for lines that lost `lost` (0 to 1) where `covered` is what they might have.
 #[inline(always)]
 pub fn fit(moments: &Moments, lines: &Lines<'_>, covered: &Column, lost: &Column) -> Record {
@@ -72,16 +87,21 @@ pub fn fit(moments: &Moments, lines: &Lines<'_>, covered: &Column, lost: &Column
             sum(count, |i| single(one * covered[i])),
             sum(count, |i| if one * covered[i] < 1.0 { covered[i] } else { 0.0 }),
         );
-        one += if slope > 0.0 { ((total - value) / slope).max(0.0) } else { 0.0 };
+        let one_step = step(total - value, slope);
         let (value, slope) = (
             sum(count, |i| layered(many * covered[i]).0),
             sum(count, |i| covered[i] * layered(many * covered[i]).1),
         );
-        many += if slope > 0.0 { ((total - value) / slope).max(0.0) } else { 0.0 };
+        let many_step = step(total - value, slope);
+        one += one_step;
+        many += many_step;
+        if one_step <= ACCURACY * one && many_step <= ACCURACY * many {
+            break;
+        }
     }
-    let error =
-        |f: &dyn Fn(f32) -> f32| sum(count, |i| (f(covered[i]) - lost[i]) * (f(covered[i]) - lost[i]));
-    let is_layered = error(&|x| layered(many * x).0) < error(&|x| single(one * x));
+    let single_error = sum(count, |i| square(single(one * covered[i]) - lost[i]));
+    let layered_error = sum(count, |i| square(layered(many * covered[i]).0 - lost[i]));
+    let is_layered = layered_error < single_error;
     aggregate(moments, lines.half, if is_layered { many } else { one }, is_layered).encode()
 }
 

@@ -154,7 +154,9 @@ impl<'d> Lines<'d> {
         self.all = if directions.count == LINES_MAX { u64::MAX } else { (1 << directions.count) - 1 };
         let h = self.half;
         let faces = [h.y * h.z, h.z * h.x, h.x * h.y];
-        for i in 0..directions.count {
+        // Bounded, so that no index is checked and the loops become vectors
+        let count = directions.count.min(LINES_MAX);
+        for i in 0..count {
             let d = [directions.along[0][i], directions.along[1][i], directions.along[2][i]];
             let shares = [faces[0] * d[0].abs(), faces[1] * d[1].abs(), faces[2] * d[2].abs()];
             let total = (shares[0] + shares[1]) + shares[2];
@@ -217,7 +219,7 @@ impl<'d> Lines<'d> {
         }
         for (across, by) in self.across.iter_mut().zip([&directions.right, &directions.up, &directions.along])
         {
-            for i in 0..directions.count {
+            for i in 0..count {
                 across[i] =
                     (self.start[0][i] * by[0][i] + self.start[1][i] * by[1][i]) + self.start[2][i] * by[2][i];
             }
