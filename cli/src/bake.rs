@@ -1,8 +1,9 @@
 //! `pantaray bake`: every bake set of a scene, decorated.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
+use engine::bake::frames::{Frames, bake_frames};
 use engine::bake::{BakeOptions, bake};
 use engine::brickmap::FarField;
 use engine::cut::Lod;
@@ -45,6 +46,9 @@ pub struct Arguments {
     /// The frame that patterns such as `####` in the scene's paths stand for
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     frame: Option<i64>,
+    /// Bake frames FIRST to LAST, every STEP, each into DIR/FRAME; what does not change is built once
+    #[arg(long, value_name = "FIRST-LAST[xSTEP]", allow_hyphen_values = true, conflicts_with = "frame")]
+    frames: Option<Frames>,
     /// Bake whole batches only, evenly spaced, up to about N points of each bake set; `baked` marks them
     #[arg(long, value_name = "N", value_parser = values::count)]
     max_points: Option<u64>,
@@ -75,7 +79,6 @@ impl Resources {
 
 /// Bakes and says how it went.
 pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
-    let scene = scene::load_frame(&arguments.scene, arguments.frame)?;
     let options = BakeOptions {
         device: arguments.device,
         lod: arguments.lod,
@@ -86,12 +89,39 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
         restart: arguments.restart,
         ..arguments.resources.options()
     };
+    if let Some(frames) = arguments.frames {
+        return run_frames(&arguments.scene, frames, &options, &arguments.output, console);
+    }
+    let scene = scene::load_frame(&arguments.scene, arguments.frame)?;
     let report = bake(&scene, &options, &arguments.output, console.control()).map_err(continuable)?;
     let mut text = describe(&report);
     for set in &report.bake_sets {
         text.push_str(&format!("\n{}", arguments.output.join(format!("{}.mgs", set.name)).display()));
     }
     Answer::new(&report, text)
+}
+
+/// Bakes a range of frames and says how each went.
+fn run_frames(
+    scene: &Path,
+    frames: Frames,
+    options: &BakeOptions,
+    output: &Path,
+    console: &Console,
+) -> Result<Answer> {
+    let load = |frame| scene::load_frame(scene, Some(frame));
+    let report = bake_frames(frames, &load, options, output, console.control()).map_err(continuable)?;
+    let mut lines: Vec<String> = Vec::new();
+    for frame in &report.frames {
+        lines.push(format!("frame {}\n{}", frame.frame, describe(&frame.report)));
+    }
+    lines.push(format!(
+        "{} frames in {}, {} of them with brick maps that were there",
+        report.frames.len(),
+        figures::seconds(report.seconds),
+        report.maps_reused
+    ));
+    Answer::new(&report, lines.join("\n"))
 }
 
 /// Says how to go on after a cancellation.

@@ -94,20 +94,19 @@ impl Folder {
         write_atomically(&path, &bytes)
     }
 
-    /// Removes what only an unfinished bake needs, brick maps of other occluders that were not finished included.
+    /// Removes what only an unfinished bake needs, brick maps of other occluders in `maps` that were not finished included.
     ///
     /// # Errors
     /// When something cannot be removed.
-    pub fn finish(&self) -> Result<()> {
+    pub fn finish(&self, maps: &Path) -> Result<()> {
         for name in ["sets", "import", "build"] {
             let path = self.path.join("work").join(name);
             if path.exists() {
                 std::fs::remove_dir_all(&path).map_err(|e| Error::io("remove", &path, e))?;
             }
         }
-        let maps = self.path.join("brickmap");
-        for entry in std::fs::read_dir(&maps).map_err(|e| Error::io("read", &maps, e))? {
-            let path = entry.map_err(|e| Error::io("read", &maps, e))?.path();
+        for entry in std::fs::read_dir(maps).map_err(|e| Error::io("read", maps, e))? {
+            let path = entry.map_err(|e| Error::io("read", maps, e))?.path();
             if is_unfinished(&path) {
                 std::fs::remove_dir_all(&path).map_err(|e| Error::io("remove", &path, e))?;
             }

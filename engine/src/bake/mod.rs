@@ -4,6 +4,7 @@
 //! interrupted bake continues where it was, and the result is the same bytes. A farm orders the same steps as tasks.
 
 pub mod folder;
+pub mod frames;
 pub mod inputs;
 pub mod map;
 pub mod set;
@@ -121,6 +122,17 @@ impl Control<'_> {
 /// # Errors
 /// Anything wrong with the inputs, the disk or the memory; nothing half-written is left where a result belongs.
 pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Control<'_>) -> Result<Report> {
+    bake_with_maps(scene, options, target, &target.join("brickmap"), control)
+}
+
+/// [`bake`] with the brick maps in the folder `maps`, which other bakes may use before and after, not meanwhile.
+fn bake_with_maps(
+    scene: &Scene,
+    options: &BakeOptions,
+    target: &Path,
+    maps_folder: &Path,
+    control: Control<'_>,
+) -> Result<Report> {
     let start = Instant::now();
     if options.memory_bytes < MEMORY_BYTES_MIN {
         return Err(Error::new(
@@ -146,7 +158,7 @@ pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Contro
         let map = match maps.iter().find(|(occluders, _)| *occluders == set.occluders) {
             Some((_, map)) => map.clone(),
             None => {
-                let places = (&*folder.path().join("brickmap"), &*folder.work("build")?);
+                let places = (maps_folder, &*folder.work("build")?);
                 let map = open_map(scene, &inputs, &set.occluders, options, places, &mut report, control)?;
                 maps.push((set.occluders.clone(), Arc::new(map)));
                 maps[maps.len() - 1].1.clone()
@@ -154,7 +166,7 @@ pub fn bake(scene: &Scene, options: &BakeOptions, target: &Path, control: Contro
         };
         report.bake_sets.push(run(set, map, &folder, &mut work, control)?);
     }
-    folder.finish()?;
+    folder.finish(maps_folder)?;
 
     // Report
     report.bake = work.report(options);
@@ -180,7 +192,7 @@ pub fn build_map(
     let inputs = import(scene, options, &folder, control)?;
     let places = (&*folder.path().join("brickmap"), &*folder.work("build")?);
     open_map(scene, &inputs, &all_occluders(scene)?, options, places, &mut report, control)?;
-    folder.finish()?;
+    folder.finish(places.0)?;
     write_report(&mut report, start, target)?;
     Ok(report)
 }

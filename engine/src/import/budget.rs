@@ -33,7 +33,7 @@ impl Budget {
                 ),
             )
             .at(&self.path)
-            .hint("allow more memory, or cut the file into parts"));
+            .hint("allow more memory (`--memory`), or cut the file into parts"));
         }
         self.held = need;
         Ok(())
