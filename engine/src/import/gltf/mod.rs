@@ -7,6 +7,7 @@ mod accessor;
 mod check;
 mod container;
 mod document;
+mod leaves;
 mod nodes;
 mod primitive;
 mod texture;
@@ -16,7 +17,8 @@ use std::path::Path;
 use self::container::Container;
 use self::document::AlphaMode;
 use self::nodes::Copies;
-use super::emit::{Carried, Emitter};
+use super::emit::{Carried, Emitter, Placement};
+use super::mesh::Mesh;
 use super::{GridSink, ImportOptions, ImportReport, cut, radius};
 use crate::Result;
 
@@ -26,7 +28,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let mut container = Container::open(path, options.memory_bytes)?;
     let copies = nodes::copies(&mut container, options, &mut report)?;
     let carried = carried(&container, &copies);
-    let with_albedo = carried.albedo;
+    let wanted = primitive::Wanted { albedo: carried.albedo, leaves: options.dice.is_some() };
     let mut emitter = Emitter::new(sink, carried, options)?;
     let mut images = texture::Images::default();
     for (&mesh, places) in &copies {
@@ -35,21 +37,44 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
         }
         for index in 0..container.document.meshes[mesh].primitives.len() {
             let mut own = ImportReport::default();
-            let read = primitive::read(&mut container, (mesh, index), &mut images, with_albedo, &mut own)?;
+            let read = primitive::read(&mut container, (mesh, index), &mut images, wanted, &mut own)?;
             add_copies(&mut report, &own, places.len() as u64);
-            let Some((mesh, bytes)) = read else { continue };
-            let clusters = cut::cut(&mesh);
-            let radius = radius::default_radius(&mesh, &clusters, 1.0);
-            radius::warn_radius(&mesh, radius, &mut report);
-            for (id, placement) in places {
-                let rate = options.dice.as_ref();
-                emitter.emit_diced(&mesh, &clusters, placement, rate, (*id, radius), &mut report)?;
-            }
-            drop(mesh);
-            container.budget.give(bytes);
+            let Some(read) = read else { continue };
+            let Some(leaves) = read.leaves else {
+                emit(&mut emitter, &read.mesh, places, options, &mut report)?;
+                drop(read.mesh);
+                container.budget.give(read.bytes);
+                continue;
+            };
+            let mut own = ImportReport::default();
+            leaves.cut(&read.mesh, &images, &mut own, |part| {
+                emit(&mut emitter, part, places, options, &mut report)
+            })?;
+            add_copies(&mut report, &own, places.len() as u64);
+            drop(read.mesh);
+            container.budget.give(read.bytes);
+            primitive::release(&mut container, leaves.colors, Some(leaves.uvs));
         }
     }
     Ok(report)
+}
+
+/// Writes a mesh wherever it stands.
+fn emit(
+    emitter: &mut Emitter<'_>,
+    mesh: &Mesh,
+    places: &[(u32, Placement)],
+    options: &ImportOptions,
+    report: &mut ImportReport,
+) -> Result<()> {
+    let clusters = cut::cut(mesh);
+    let radius = radius::default_radius(mesh, &clusters, 1.0);
+    radius::warn_radius(mesh, radius, report);
+    for (id, placement) in places {
+        let rate = options.dice.as_ref();
+        emitter.emit_diced(mesh, &clusters, placement, rate, (*id, radius), report)?;
+    }
+    Ok(())
 }
 
 /// The attributes that the placed primitives need, by what the document says of them.

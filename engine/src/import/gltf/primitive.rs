@@ -4,6 +4,7 @@ use glam::{DVec3, Vec2, Vec3};
 
 use super::container::{Container, missing, unsupported};
 use super::document::{AlphaMode, Primitive};
+use super::leaves::{self, Leaves};
 use super::texture::{Averager, Images, Texture, coverage};
 use crate::import::emit::opacity_byte;
 use crate::import::mesh::{Face, Mesh};
@@ -13,23 +14,39 @@ use crate::{Error, ErrorKind, Result};
 const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
 
 /// A material as far as it is read.
-struct Surface {
-    factor: [f32; 4],
-    texture: Option<Texture>,
-    alpha: AlphaMode,
+pub(super) struct Surface {
+    pub factor: [f32; 4],
+    pub texture: Option<Texture>,
+    pub alpha: AlphaMode,
 }
 
-/// Reads primitive `index` of mesh `mesh`. None when it has nothing to show. What the mesh takes is taken from the
-/// budget and returned, to be given back.
+/// A primitive in memory.
+pub(super) struct Read {
+    pub mesh: Mesh,
+    /// What was taken from the budget for it, to be given back.
+    pub bytes: u64,
+    /// What its faces are to be cut by; without it they are painted.
+    pub leaves: Option<Leaves>,
+}
+
+/// What is wanted of a primitive.
+#[derive(Clone, Copy)]
+pub(super) struct Wanted {
+    pub albedo: bool,
+    /// Whether faces whose texture lets light through are to be cut along it.
+    pub leaves: bool,
+}
+
+/// Reads primitive `index` of mesh `mesh`. None when it has nothing to show.
 pub(super) fn read(
     container: &mut Container,
     (mesh, index): (usize, usize),
     images: &mut Images,
-    with_albedo: bool,
+    wanted: Wanted,
     report: &mut ImportReport,
-) -> Result<Option<(Mesh, u64)>> {
+) -> Result<Option<Read>> {
     let primitive = std::mem::take(&mut container.document.meshes[mesh].primitives[index].attributes);
-    let outcome = read_attributes(container, (mesh, index), &primitive, images, with_albedo, report);
+    let outcome = read_attributes(container, (mesh, index), &primitive, images, wanted, report);
     container.document.meshes[mesh].primitives[index].attributes = primitive;
     outcome.map_err(|error| within(error, mesh, index))
 }
@@ -56,9 +73,9 @@ fn read_attributes(
     place: (usize, usize),
     attributes: &Attributes,
     images: &mut Images,
-    with_albedo: bool,
+    wanted: Wanted,
     report: &mut ImportReport,
-) -> Result<Option<(Mesh, u64)>> {
+) -> Result<Option<Read>> {
     let primitive: &Primitive = &container.document.meshes[place.0].primitives[place.1];
     let (indices, material, mode) = (primitive.indices, primitive.material, primitive.mode.unwrap_or(4));
     let compressed = primitive.extensions.keys().find(|name| name.contains("draco")).cloned();
@@ -110,22 +127,40 @@ fn read_attributes(
         },
         None => None,
     };
-    let vertex_color = |vertex: usize| -> [f32; 4] {
-        match &colors {
-            Some(((values, components), _)) => {
-                std::array::from_fn(|i| if i < *components { values[vertex * components + i] } else { 1.0 })
-            }
-            None => [1.0; 4],
-        }
-    };
-    paint(&mut mesh, &surface, images, uvs.as_deref(), vertex_color, with_albedo);
-    if let Some(((values, _), _)) = colors {
+    let mut colors = colors.map(|(colors, _)| colors);
+    let see_through = surface.texture.is_some() && surface.alpha != AlphaMode::Opaque;
+    if wanted.leaves
+        && see_through
+        && mesh.faces.iter().all(|face| face.arity == 3)
+        && let Some(uvs) = uvs
+    {
+        container.budget.take(leaves::BYTES, "cutting faces to texels")?;
+        let leaves = Leaves { surface, uvs, colors, with_albedo: wanted.albedo };
+        return Ok(Some(Read { mesh, bytes: bytes + leaves::BYTES, leaves: Some(leaves) }));
+    }
+    paint(&mut mesh, &surface, images, uvs.as_deref(), |v| vertex_color(colors.as_ref(), v), wanted.albedo);
+    release(container, colors.take(), uvs);
+    Ok(Some(Read { mesh, bytes, leaves: None }))
+}
+
+/// Gives back what the colours and the texture coordinates of vertices take.
+pub(super) fn release(container: &mut Container, colors: Option<(Vec<f32>, usize)>, uvs: Option<Vec<f32>>) {
+    if let Some((values, _)) = colors {
         container.release(values);
     }
     if let Some(values) = uvs {
         container.release(values);
     }
-    Ok(Some((mesh, bytes)))
+}
+
+/// The colour of a vertex, white where it has none.
+pub(super) fn vertex_color(colors: Option<&(Vec<f32>, usize)>, vertex: usize) -> [f32; 4] {
+    match colors {
+        Some((values, components)) => {
+            std::array::from_fn(|i| if i < *components { values[vertex * components + i] } else { 1.0 })
+        }
+        None => [1.0; 4],
+    }
 }
 
 fn same_count(accessor: usize, count: usize, mesh: &Mesh) -> Result<()> {

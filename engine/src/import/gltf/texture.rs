@@ -20,6 +20,9 @@ const PATTERN_MAX: u32 = 128;
 /// Samples taken for all faces of a primitive at most, about: a few seconds. Large meshes get fewer per face.
 const SAMPLES_MAX: u64 = 1 << 29;
 
+/// Coverage that differs by less is even: half the step of an opacity.
+const EVEN: f32 = 0.5 / 255.0;
+
 /// Faces remembered by their texture coordinates: copies of one leaf card share theirs.
 const MEMORY_MAX: usize = 1 << 16;
 
@@ -138,6 +141,15 @@ impl Images {
     fn get(&self, texture: &Texture) -> &Image {
         let found = self.loaded.iter().find(|(known, _)| *known == texture.image);
         &found.expect("the image of a texture is loaded right before it is used").1
+    }
+}
+
+#[cfg(test)]
+impl Images {
+    /// A square image of texels row by row, and a texture that repeats it.
+    pub fn square(size: u32, texels: Vec<u8>) -> (Self, Texture) {
+        let images = Self { loaded: vec![(0, Image { width: size, height: size, texels })] };
+        (images, Texture { image: 0, wrap: [Wrap::Repeat; 2], set: 0, transform: None })
     }
 }
 
@@ -277,8 +289,44 @@ impl<'a> Averager<'a> {
         average
     }
 
+    /// The longest edge of a triangle of given texture coordinates, in texels.
+    pub fn longest_edge(&self, uv: [Vec2; 3]) -> f32 {
+        let size = Vec2::new(self.image.width as f32, self.image.height as f32);
+        let at = uv.map(|uv| self.texture.place(uv) * size);
+        (0..3).map(|i| at[i].distance(at[(i + 1) % 3])).fold(0.0, f32::max)
+    }
+
+    /// Whether coverage is the same, but for rounding, at every texel of the box about a triangle.
+    pub fn is_even(&self, uv: [Vec2; 3], alphas: [f32; 3]) -> bool {
+        let size = [self.image.width, self.image.height];
+        let at = uv.map(|uv| self.texture.place(uv));
+        let range = |axis: usize| {
+            let low = at.iter().map(|uv| uv[axis]).fold(f32::INFINITY, f32::min);
+            let high = at.iter().map(|uv| uv[axis]).fold(f32::NEG_INFINITY, f32::max);
+            // A box of the image's size and more has every texel
+            let texels = ((high - low) * size[axis] as f32).ceil().clamp(0.0, size[axis] as f32) as u32;
+            (0..=texels.min(size[axis] - 1))
+                .map(move |i| self.texture.wrap[axis].texel(low + i as f32 / size[axis] as f32, size[axis]))
+        };
+        let vertex_low = alphas.into_iter().fold(f32::INFINITY, f32::min);
+        let vertex_high = alphas.into_iter().fold(0.0, f32::max);
+        let (mut low, mut high) = (f32::INFINITY, 0.0_f32);
+        for y in range(1) {
+            for x in range(0) {
+                let texel = self.image.texels[4 * (y as usize * size[0] as usize + x as usize) + 3];
+                let alpha = f32::from(texel) * (1.0 / 255.0) * self.factor;
+                low = low.min(coverage(self.alpha, alpha * vertex_low));
+                high = high.max(coverage(self.alpha, alpha * vertex_high));
+                if high - low > EVEN {
+                    return false;
+                }
+            }
+        }
+        true
+    }
+
     /// Samples at the centroids of equal parts of the triangle, about three for two texels.
-    fn sample(&self, uv: [Vec2; 3], alphas: [f32; 3]) -> Average {
+    pub fn sample(&self, uv: [Vec2; 3], alphas: [f32; 3]) -> Average {
         let size = Vec2::new(self.image.width as f32, self.image.height as f32);
         let uv = uv.map(|uv| self.texture.place(uv));
         let texels = 0.5 * ((uv[1] - uv[0]) * size).perp_dot((uv[2] - uv[0]) * size).abs();
