@@ -211,7 +211,7 @@ mod bench {
         };
         let path = folder.path().join("map");
         let progress = |stage: &str, done: f64| control.progress.update(stage, done, "");
-        build(&mut [OccluderStream { stream: &mut stream }], &options, &path, &progress, control.cancel)?;
+        build(&mut [OccluderStream::once(&mut stream)], &options, &path, &progress, control.cancel)?;
         let map = Arc::new(BrickMap::open(&path)?);
         let shading = Shading::new(&ShOcclusion::default(), 0, "bench", map.shift(0));
         for device in devices {

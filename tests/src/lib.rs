@@ -176,7 +176,7 @@ pub fn build_map_with(
     };
     let target = folder.join("map");
     let mut streams: Vec<OccluderStream<'_>> =
-        occluders.iter_mut().map(|stream| OccluderStream { stream: &mut **stream }).collect();
+        occluders.iter_mut().map(|stream| OccluderStream::once(&mut **stream)).collect();
     build(&mut streams, &options, &target, &|_, _| {}, &AtomicBool::new(false)).expect("the map builds");
     Arc::new(BrickMap::open(&target).expect("the map opens"))
 }

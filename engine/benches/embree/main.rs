@@ -264,7 +264,7 @@ fn build_map(stream: &mut dyn MicrogridStream, folder: &std::path::Path) -> Arc<
     };
     std::fs::create_dir_all(&options.scratch).expect("a folder can be made");
     let target = folder.join("map");
-    let mut streams = [OccluderStream { stream }];
+    let mut streams = [OccluderStream::once(stream)];
     build(&mut streams, &options, &target, &|_, _| {}, &AtomicBool::new(false)).expect("the map builds");
     Arc::new(BrickMap::open(&target).expect("the map opens"))
 }

@@ -34,7 +34,7 @@ fn main() {
         };
         let target = folder.join("map");
         let report = build(
-            &mut [OccluderStream { stream: &mut scene }],
+            &mut [OccluderStream::once(&mut scene)],
             &options,
             &target,
             &|_, _| {},

@@ -168,6 +168,21 @@ impl Inputs {
     /// # Errors
     /// When a file cannot be opened.
     pub fn open(&self, scene: &Scene, geometry: usize) -> Result<Box<dyn MicrogridStream>> {
+        Ok(match self.open_prototype(scene, geometry)? {
+            (stream, None) => stream,
+            (stream, Some(copies)) => Box::new(Instance::new(stream, copies)?),
+        })
+    }
+
+    /// The stream of a geometry as it stands before the scene copies it, and where it does; none where it stands once.
+    ///
+    /// # Errors
+    /// When a file cannot be opened.
+    pub(super) fn open_prototype(
+        &self,
+        scene: &Scene,
+        geometry: usize,
+    ) -> Result<(Box<dyn MicrogridStream>, Option<Matrices>)> {
         let Geometry { streams, instances, .. } = &scene.geometries[geometry];
         let mut opened: Vec<Box<dyn MicrogridStream>> = Vec::with_capacity(streams.len());
         for (source, file) in streams.iter().zip(&self.files[geometry]) {
@@ -187,15 +202,12 @@ impl Inputs {
             1 => opened.remove(0),
             _ => Box::new(Concat::new(opened)?),
         };
-        if instances.is_empty() {
-            return Ok(stream);
-        }
-        Ok(Box::new(Instance::new(stream, Matrices::new(instances))?))
+        Ok((stream, (!instances.is_empty()).then(|| Matrices::new(instances))))
     }
 }
 
 /// A geometry's copies as the instance adapter reads them: inline matrices and files, one after the other.
-struct Matrices {
+pub(super) struct Matrices {
     instances: Vec<Instances>,
     next: usize,
     reader: Option<InstanceReader>,

@@ -10,6 +10,7 @@ use super::{BakeOptions, Control};
 use crate::brickmap::{BrickMap, BuildOptions, BuildReport, OccluderStream, build, content_key};
 use crate::scene::{BakeSet, Scene};
 use crate::stats::Report;
+use crate::stream::adapt::MatrixSource;
 use crate::{Error, Result};
 
 /// The geometries that a bake set sees, by number.
@@ -73,10 +74,17 @@ pub fn build_if_missing(
     if target.join("manifest.json").exists() {
         return Ok(None);
     }
-    let mut streams =
-        geometries.iter().map(|&geometry| inputs.open(scene, geometry)).collect::<Result<Vec<_>>>()?;
-    let mut occluders: Vec<OccluderStream<'_>> =
-        streams.iter_mut().map(|stream| OccluderStream { stream: stream.as_mut() }).collect();
+    let mut opened = geometries
+        .iter()
+        .map(|&geometry| inputs.open_prototype(scene, geometry))
+        .collect::<Result<Vec<_>>>()?;
+    let mut occluders: Vec<OccluderStream<'_>> = opened
+        .iter_mut()
+        .map(|(stream, copies)| OccluderStream {
+            stream: stream.as_mut(),
+            instances: copies.as_mut().map(|copies| copies as &mut dyn MatrixSource),
+        })
+        .collect();
     let progress = |stage: &str, done: f64| control.progress.update(stage, done, "");
     build(&mut occluders, &build_options(options, scratch), target, &progress, control.cancel).map(Some)
 }

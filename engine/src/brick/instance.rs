@@ -124,6 +124,18 @@ impl Instance {
         self.evenness
     }
 
+    /// What a squared distance in steps of the map is on the prototype's lattice, at least, where angles inside are judged by
+    /// [`evenness`](Self::evenness): that is counted as distance.
+    pub fn distance2_inside(&self, distance2: f64) -> f64 {
+        // The largest stretch is at least the longest column's, the smallest that times the root of the evenness
+        let columns = self.directions().map(|column| f64::from(column.length_squared()));
+        let stretch2 = columns.iter().fold(0.0_f64, |largest, &x| largest.max(x));
+        let scale = exp2(i32::from(self.exponent) + LINEAR_BITS);
+        let evenness = f64::from(self.evenness);
+        // A hair less, so that rounding never closes what a walk opens
+        0.999_99 * distance2 * stretch2 * scale * scale * evenness * evenness
+    }
+
     /// Whether the prototype can be entered from points whose squared distance from the instance's box, in steps of the map,
     /// is `distance2`. From farther away its far field stands in for it.
     #[inline(always)]

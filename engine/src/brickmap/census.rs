@@ -20,7 +20,7 @@ const THREAD_BYTES: u64 = 32 << 20;
 const QUADS_MEASURED: usize = 16;
 
 /// Micropolygons by the binary logarithm of their grid's mean edge, from 2^-64 to 2^63 scene units.
-type Edges = [u64; 128];
+pub(super) type Edges = [u64; 128];
 
 /// What pass 1 finds.
 pub struct Census {
@@ -33,7 +33,7 @@ pub struct Census {
     /// A hash of everything that the map depends on.
     pub content: u128,
     /// Per stream.
-    edges: Vec<Edges>,
+    pub(super) edges: Vec<Edges>,
 }
 
 /// The columns of a stream that matter to occlusion.
@@ -62,8 +62,12 @@ impl Census {
     /// # Errors
     /// When the geometry is too far away for any.
     pub fn lattice(&self) -> Result<Lattice> {
-        let exponent = self.edges.iter().filter_map(typical_exponent).min().unwrap_or(0);
-        Lattice::new(exponent, &self.bounds)
+        Lattice::new(self.exponent().unwrap_or(0), &self.bounds)
+    }
+
+    /// The exponent of the finest stream's step; none if there is no stream with faces.
+    pub fn exponent(&self) -> Option<i32> {
+        self.edges.iter().filter_map(typical_exponent).min()
     }
 
     /// The lattice shift of every stream.
@@ -116,7 +120,7 @@ pub fn count(occluders: &mut [OccluderStream<'_>], job: &Job<'_>) -> Result<Cens
     let mut tallies: Vec<Tally> = (0..threads).map(|_| tally()).collect();
     let mut all_edges = Vec::with_capacity(occluders.len());
     let streams = occluders.len() as f64;
-    for (number, OccluderStream { stream }) in occluders.iter_mut().enumerate() {
+    for (number, OccluderStream { stream, .. }) in occluders.iter_mut().enumerate() {
         stream.rewind()?;
         let schema = stream.schema().clone();
         let columns = Columns::of(&schema);
@@ -142,7 +146,7 @@ pub fn count(occluders: &mut [OccluderStream<'_>], job: &Job<'_>) -> Result<Cens
         sum.content = sum.content.wrapping_add(tally.content);
         sum.cells.merge(tally.cells);
     }
-    if sum.grids == 0 {
+    if sum.grids == 0 && !occluders.is_empty() {
         return Err(Error::invalid("the occluders hold no geometry"));
     }
     let mut content = Xxh3::new();

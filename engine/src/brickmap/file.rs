@@ -27,7 +27,7 @@ use crate::math::Bounds;
 use crate::{Error, ErrorKind, Result};
 
 /// The version of bricks and map. Others are refused.
-pub const FORMAT_VERSION: u32 = 2;
+pub const FORMAT_VERSION: u32 = 3;
 
 /// Bytes of a segment at most.
 pub(super) const SEGMENT_BYTES: u64 = 1 << 30;
@@ -64,6 +64,10 @@ pub struct Manifest {
     pub grids: u64,
     /// The far field.
     pub far_field: FarField,
+    /// Copies of prototypes: micropolygons count as often as they stand.
+    pub instances: u64,
+    /// Prototypes.
+    pub prototypes: u64,
     /// Where the bytes go.
     pub split: ByteSplit,
     /// Leaves, and nodes: with the counts above, how full they are.

@@ -25,7 +25,7 @@ pub fn fill(
 ) -> Result<()> {
     let mut states: Vec<(Microgrid, Quantised)> = vec![Default::default(); job.options.threads.max(1)];
     let streams = occluders.len() as f64;
-    for (number, (OccluderStream { stream }, &shift)) in occluders.iter_mut().zip(shifts).enumerate() {
+    for (number, (OccluderStream { stream, .. }, &shift)) in occluders.iter_mut().zip(shifts).enumerate() {
         stream.rewind()?;
         let schema = stream.schema().clone();
         let columns = Columns::of(&schema);

@@ -26,6 +26,7 @@ mod output;
 pub mod pack;
 mod partition;
 mod sah;
+mod shared;
 pub mod spill;
 mod tiling;
 mod writer;
@@ -39,21 +40,33 @@ pub use farfield::FarField;
 pub use file::{BrickMap, FORMAT_VERSION, Manifest, SegmentSource};
 use log::Spill;
 use output::Output;
-use pack::{ByteSplit, Primitive};
+use pack::ByteSplit;
+use shared::Prototype;
 pub use writer::{is_unfinished, unfinished_path};
 
 use crate::brick::lattice::{self, Lattice};
 use crate::stream::MicrogridStream;
+use crate::stream::adapt::{Instance, MatrixSource};
 use crate::{Error, ErrorKind, Result};
 
 /// Micropolygons of a partition at most. Larger ones would make a slightly better tree, smaller ones a much worse one; this
 /// size leaves two threads room in 256 MiB.
 const PARTITION_MICROPOLYGONS: u64 = 1 << 19;
 
-/// A stream of occluding microgrids, in the scene's units, instances expanded.
+/// A stream of occluding microgrids in the scene's units, or of a prototype and where its copies stand.
 pub struct OccluderStream<'a> {
     /// The stream; it is read twice.
     pub stream: &'a mut dyn MicrogridStream,
+    /// World from object for every copy; none where the stream stands once, as it is. Whether copies share bricks is decided by
+    /// a rule ([`shared`]).
+    pub instances: Option<&'a mut dyn MatrixSource>,
+}
+
+impl<'a> OccluderStream<'a> {
+    /// A stream that stands once, as it is.
+    pub fn once(stream: &'a mut dyn MicrogridStream) -> Self {
+        Self { stream, instances: None }
+    }
 }
 
 /// How to build.
@@ -88,6 +101,10 @@ pub struct BuildReport {
     pub nodes: u64,
     /// Partitions.
     pub partitions: usize,
+    /// Copies that share bricks, and what they are copies of.
+    pub instances: u64,
+    /// Prototypes.
+    pub prototypes: u64,
     /// Partitions that an interrupted build had written.
     pub continued_partitions: usize,
     /// Bytes of temporary data.
@@ -152,11 +169,30 @@ pub fn build(
     let job = Job { options, progress, cancel };
     let mut report = BuildReport::default();
 
-    // Pass 1: count
+    // What shares bricks, and what is expanded
     let start = Instant::now();
-    let mut census = census::count(occluders, &job)?;
-    report.grids = census.grids;
-    let lattice = census.lattice()?;
+    let prototypes = find_prototypes(occluders, &job)?;
+    let is_shared = |number: usize| prototypes.iter().any(|prototype| prototype.occluder == number);
+
+    // Pass 1: count what is expanded
+    let mut numbers = Vec::new();
+    let mut streams: Vec<Box<dyn MicrogridStream + '_>> = Vec::new();
+    let mut shared = Vec::new();
+    for (number, occluder) in occluders.iter_mut().enumerate() {
+        match &mut occluder.instances {
+            _ if is_shared(number) => shared.push(&mut *occluder.stream),
+            None => streams.push(Box::new(&mut *occluder.stream)),
+            Some(source) => streams.push(Box::new(Instance::new(&mut *occluder.stream, &mut **source)?)),
+        }
+        if !is_shared(number) {
+            numbers.push(number);
+        }
+    }
+    let mut flat: Vec<OccluderStream<'_>> =
+        streams.iter_mut().map(|stream| OccluderStream::once(stream.as_mut())).collect();
+    let mut census = census::count(&mut flat, &job)?;
+    report.grids = census.grids + prototypes.iter().map(|prototype| prototype.grids).sum::<u64>();
+    let lattice = map_lattice(&census, &prototypes)?;
     let shifts = census.shifts(&lattice);
     let partitions = census.cells.partition(PARTITION_MICROPOLYGONS).len();
     report.count_seconds = start.elapsed().as_secs_f64();
@@ -164,13 +200,30 @@ pub fn build(
     // What an interrupted build has left
     let mut content = xxhash_rust::xxh3::Xxh3::new();
     content.update(&census.content.to_le_bytes());
+    prototypes.iter().for_each(|prototype| content.update(&prototype.content.to_le_bytes()));
     content.update(parameters(options).as_bytes());
     let mut output = Output::open(target, content.digest128())?;
     report.continued_partitions = output.partitions;
 
-    // Pass 2 and the partitions
-    let done =
-        fill_and_build(occluders, census, (&lattice, &shifts), partitions, &mut output, &job, &mut report);
+    // The prototypes, pass 2 and the partitions, the tree over all
+    let done = (|| {
+        let mut first = 0;
+        for stream in shared {
+            first = build_prototype(stream, first, &mut output, &job, &mut report)?;
+        }
+        let whole = (first, partitions);
+        fill_and_build(&mut flat, census, (&lattice, &shifts), whole, &mut output, &job, &mut report)?;
+        report.partitions = first - prototypes.len() + output.roots.len();
+        let (mut placed, mut copies) = (Vec::new(), Vec::new());
+        for (number, prototype) in prototypes.iter().enumerate() {
+            if let Some(root) = output.prototypes[number].root {
+                prototype.place(number as u32, &root, &lattice, &mut placed, &mut copies)?;
+            }
+        }
+        report.instances = copies.len() as u64;
+        report.prototypes = prototypes.len() as u64;
+        output.write_top(&copies, &placed)
+    })();
     let root = match done {
         Ok(root) => root,
         Err(error) => {
@@ -182,13 +235,14 @@ pub fn build(
     };
 
     // The manifest
-    report.partitions = output.roots.len();
+    let mut all_shifts = vec![0; numbers.len() + prototypes.len()];
+    numbers.iter().zip(&shifts).for_each(|(&number, &shift)| all_shifts[number] = shift);
     let Output { writer, split, skipped, leaves, .. } = output;
     let manifest = Manifest {
         version: FORMAT_VERSION,
         lattice_exponent: lattice.exponent,
         lattice_origin: lattice.origin.to_array(),
-        shifts,
+        shifts: all_shifts,
         low: root.bounds.min.to_array(),
         high: root.bounds.max.to_array(),
         bricks: writer.bricks(),
@@ -197,6 +251,8 @@ pub fn build(
         micropolygons: root.micropolygons,
         grids: report.grids,
         far_field: options.far_field,
+        instances: report.instances,
+        prototypes: report.prototypes,
         split,
         leaves,
         nodes: split.far_field / 48,
@@ -216,29 +272,68 @@ pub fn build(
     })
 }
 
-/// Pass 2, the partitions that are not written yet, and the tree over them. Returns the root.
+/// The geometries whose copies share bricks, in their order.
+fn find_prototypes(occluders: &mut [OccluderStream<'_>], job: &Job<'_>) -> Result<Vec<Prototype>> {
+    let (mut prototypes, mut taken) = (Vec::new(), 0);
+    for occluder in occluders.iter_mut().enumerate() {
+        if let Some(prototype) = Prototype::judge(occluder, taken, job)? {
+            taken += prototype.copies();
+            prototypes.push(prototype);
+        }
+    }
+    Ok(prototypes)
+}
+
+/// The lattice for what is expanded and for the boxes of what is not.
+fn map_lattice(census: &Census, prototypes: &[Prototype]) -> Result<Lattice> {
+    let bounds = prototypes.iter().fold(census.bounds, |all, prototype| all.union(&prototype.world_bounds()));
+    let exponents = census.exponent().into_iter().chain(prototypes.iter().map(Prototype::world_exponent));
+    Lattice::new(exponents.min().unwrap_or(0), &bounds)
+}
+
+/// Builds a prototype whose partitions are numbered from `first` on, as far as it is not written yet. Returns the number that
+/// comes after it.
+fn build_prototype(
+    stream: &mut dyn MicrogridStream,
+    first: usize,
+    output: &mut Output,
+    job: &Job<'_>,
+    report: &mut BuildReport,
+) -> Result<usize> {
+    let mut own = [OccluderStream::once(stream)];
+    let mut census = census::count(&mut own, job)?;
+    let (lattice, partitions) = (census.lattice()?, census.cells.partition(PARTITION_MICROPOLYGONS).len());
+    let top = first + partitions;
+    if output.partitions <= top {
+        fill_and_build(&mut own, census, (&lattice, &[0]), (first, partitions), output, job, report)?;
+        output.write_prototype(top)?;
+    }
+    Ok(top + 1)
+}
+
+/// Pass 2 and those of the partitions from `first` on that are not written yet.
 fn fill_and_build(
     occluders: &mut [OccluderStream<'_>],
     census: Census,
     on_lattice: (&Lattice, &[u8]),
-    partitions: usize,
+    (first, partitions): (usize, usize),
     output: &mut Output,
     job: &Job<'_>,
     report: &mut BuildReport,
-) -> Result<Primitive> {
-    let done = output.partitions;
+) -> Result<()> {
+    let done = output.partitions.saturating_sub(first);
     if done < partitions {
         let start = Instant::now();
         let mut spill = Spill::create(&job.options.scratch, partitions, job.options.memory_bytes / 4)?;
         fill::fill(occluders, &census, on_lattice, done, &mut spill, job)?;
         drop(census);
         let (spilled, bytes) = spill.finish()?;
-        report.fill_seconds = start.elapsed().as_secs_f64();
+        report.fill_seconds += start.elapsed().as_secs_f64();
         let start = Instant::now();
-        report.spilled_bytes = bytes + partition::build_all(spilled, done, output, job)?;
-        report.build_seconds = start.elapsed().as_secs_f64();
+        report.spilled_bytes += bytes + partition::build_all(spilled, (first, done), output, job)?;
+        report.build_seconds += start.elapsed().as_secs_f64();
     }
-    output.write_top()
+    Ok(())
 }
 
 /// What every step of a build needs to know.

@@ -6,10 +6,11 @@
 
 use super::bvh::{WideChild, WideNode, WideTree};
 use super::farfield::{self, shapes::Shapes};
+use super::shared::Placed;
 use crate::brick::lanes::InstructionSet;
 use crate::brick::leaf::{self, Layout};
 use crate::brick::node::{LOCATION_BYTES, WIDTH};
-use crate::brick::{CHILDREN_MAX, Child, LatticeBox, Node, assemble, far};
+use crate::brick::{CHILDREN_MAX, Child, INSTANCE_BYTES, LatticeBox, Node, assemble};
 
 /// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
 /// larger ones load what a batch does not touch.
@@ -27,6 +28,8 @@ pub enum Content {
     },
     /// A brick that is written already.
     Brick(u32),
+    /// A copy of a prototype, by its place among all of the top level.
+    Instance(u32),
 }
 
 /// What a tree is built over: a leaf, or, at the top level, the root brick of a partition.
@@ -115,9 +118,12 @@ pub fn pack(
         Far::Directional(others) => {
             out.root = Some(fill_directional(tree, primitives, leaves, others, &mut nodes));
         }
-        Far::Over(roots) => fill_top(tree, roots, &mut nodes),
+        Far::Over(top) if top.is_paper => fill_paper(tree, primitives, &subtrees, &mut nodes),
+        Far::Over(top) => farfield::top::fill(tree, primitives, top, &mut nodes),
     }
-    let mut packer = Packer { tree, primitives, leaves, subtrees: &subtrees, nodes, first_number, out };
+    let placed = if let Far::Over(top) = far { top.placed } else { &[] };
+    let mut packer =
+        Packer { tree, primitives, leaves, placed, subtrees: &subtrees, nodes, first_number, out };
     let number = packer.brick(0);
     let root = &subtrees[0];
     Primitive {
@@ -136,8 +142,21 @@ pub enum Far<'a> {
     Paper,
     /// By lines through the leaves, among others' geometry.
     Directional(farfield::Others<'a>),
-    /// From what was found of the roots of partitions, which the tree is over.
-    Over(&'a [farfield::Root]),
+    /// From what was found of the roots that the tree is over.
+    Over(&'a Top<'a>),
+}
+
+/// What a tree over partitions and copies of prototypes needs to know of them.
+#[derive(Debug)]
+pub struct Top<'a> {
+    /// Whether the far field is the paper's, which needs nothing of what follows but `placed`.
+    pub is_paper: bool,
+    /// Roots of the partitions, which are the first primitives.
+    pub roots: &'a [farfield::Root],
+    /// Roots of the prototypes.
+    pub prototypes: &'a [farfield::Root],
+    /// The copies.
+    pub placed: &'a [Placed],
 }
 
 /// The tree's nodes with boxes, without far field; their children are not placed yet.
@@ -185,19 +204,6 @@ fn fill_directional(
     root
 }
 
-/// Fills the nodes over partitions. Those that hold several are always opened: a batch that is far enough away from them is
-/// rare, and they are few.
-fn fill_top(tree: &WideTree, roots: &[farfield::Root], nodes: &mut [Node]) {
-    for (node, wide) in nodes.iter_mut().zip(&tree.nodes) {
-        for (slot, child) in wide.children[..usize::from(wide.count)].iter().enumerate() {
-            node.far[slot] = match *child {
-                WideChild::Primitive(root) => roots[root as usize].record(&node.child_box(slot)),
-                WideChild::Node(_) => far::marked([0; 6]),
-            };
-        }
-    }
-}
-
 /// Sums of areas below a child: of all, and weighted by opacity.
 fn areas(child: &WideChild, primitives: &[Primitive], subtrees: &[Subtree]) -> (f32, f32) {
     match *child {
@@ -239,6 +245,7 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
                     sum.bytes += match p.content {
                         Content::Leaf { bytes, .. } => bytes as usize,
                         Content::Brick(_) => 8,
+                        Content::Instance(_) => INSTANCE_BYTES,
                     };
                 }
                 WideChild::Node(child) => {
@@ -275,6 +282,7 @@ struct Packer<'a> {
     tree: &'a WideTree,
     primitives: &'a [Primitive],
     leaves: &'a [u8],
+    placed: &'a [Placed],
     subtrees: &'a [Subtree],
     nodes: Vec<Node>,
     first_number: u32,
@@ -330,6 +338,13 @@ impl Packer<'_> {
                             Content::Brick(number) => {
                                 table.push(number);
                                 Child::Brick((table.len() - 1) as u16)
+                            }
+                            Content::Instance(copy) => {
+                                let here = (leaves.len() / LOCATION_BYTES) as u16;
+                                let record = self.placed[copy as usize].record(node.lower_corner(slot));
+                                let record = record.expect("checked when it was placed");
+                                leaves.extend_from_slice(bytemuck::bytes_of(&record));
+                                Child::Instance(here)
                             }
                         }
                     }

@@ -24,11 +24,16 @@ const TABLES_MAX: usize = 4;
 /// field keeps its sums beside them.
 const BYTES_PER_MICROPOLYGON: u64 = 220;
 
-/// Builds what was spilled and writes it. `done` partitions are written already.
+/// Builds what was spilled and writes it. `done` partitions are written already; in the map they are numbered from `first` on.
 ///
 /// # Errors
 /// When the disk is full or fails, or the build is cancelled.
-pub fn build_all(spilled: Vec<Spilled>, done: usize, output: &mut Output, job: &Job<'_>) -> Result<u64> {
+pub fn build_all(
+    spilled: Vec<Spilled>,
+    (first_number, done): (usize, usize),
+    output: &mut Output,
+    job: &Job<'_>,
+) -> Result<u64> {
     let count = spilled.len();
     let bounds: Vec<LatticeBox> = spilled.iter().map(|spilled| spilled.bounds).collect();
     let (mut parts, mut spilled_bytes) = (Vec::new(), 0);
@@ -50,7 +55,11 @@ pub fn build_all(spilled: Vec<Spilled>, done: usize, output: &mut Output, job: &
     };
     let mut threads = vec![(); job.options.threads.max(1)];
     let work = |(): &mut (), (part, permit)| build_within(permit, &part, job);
-    in_order(&mut threads, next, work, |(built, _permit)| output.write(built))?;
+    let write = |(mut built, _permit): (Built, Permit<'_>)| {
+        built.partition += first_number;
+        output.write(built)
+    };
+    in_order(&mut threads, next, work, write)?;
     Ok(spilled_bytes)
 }
 

@@ -1,10 +1,13 @@
 //! Level-of-detail selection: which bricks a batch's rays can tell apart (paper, section 4.4, figure 6).
 
+use std::collections::BTreeMap;
+
 use glam::IVec3;
 
 use super::Arena;
 use crate::brick::far;
 use crate::brick::node::{Child, LatticeBox, Node};
+use crate::brick::{Brick, Instance};
 use crate::{Error, Result};
 
 /// How far to open the brick map.
@@ -109,76 +112,123 @@ pub fn select(
         cut.bytes = map.bytes();
         return arena.load_everything();
     }
-    let (brick_open2, node_open2) = (lod.brick_open2(solid_angle), lod.node_open2(solid_angle));
-    let mut level = vec![map.root()];
-    let mut next = Vec::new();
-    let mut fits = true;
-    while !level.is_empty() {
-        level.sort_unstable();
-        arena.add_to_cut(&level);
-        cut.bricks.extend_from_slice(&level);
-        let mut rest = level.as_slice();
-        while !rest.is_empty() {
-            let mut loaded = arena.load(rest)?;
-            if loaded == 0 {
-                // The cut is larger than the arena: go on selecting with what comes in now
-                fits = false;
-                arena.release();
-                loaded = arena.load(rest)?.max(1);
-            }
-            for &brick in &rest[..loaded] {
-                cut.bytes += u64::from(map.brick_bytes(brick));
-                let Some(brick) = arena.brick(brick) else { continue };
-                open_children(&brick, batch, brick_open2, node_open2, &mut next);
-            }
-            rest = &rest[loaded..];
-        }
-        level.clear();
-        std::mem::swap(&mut level, &mut next);
+    let open2 = [lod.brick_open2(solid_angle), lod.node_open2(solid_angle)];
+    let mut selection =
+        Selection { seen: Seen::From(*batch), open2, next: Vec::new(), prototypes: BTreeMap::new() };
+    let mut fits = selection.open(vec![map.root()], arena, cut)?;
+
+    // Every prototype once, as its nearest instance needs it
+    for (root, distance2) in std::mem::take(&mut selection.prototypes) {
+        selection.seen = Seen::FromAfar(distance2);
+        fits &= selection.open(vec![root], arena, cut)?;
     }
     cut.bricks.sort_unstable();
     Ok(fits)
 }
 
-/// Adds the child bricks that the batch opens to `next`.
-fn open_children(
-    brick: &crate::brick::Brick<'_>,
-    batch: &LatticeBox,
-    brick_open2: f32,
-    node_open2: f32,
-    next: &mut Vec<u32>,
-) {
-    let mut stack = [0_u8; 256];
-    let mut depth = 1;
-    while depth > 0 {
-        depth -= 1;
-        let index = usize::from(stack[depth]);
-        let node = brick.node(index);
-        for slot in 0..usize::from(node.count) {
-            match node.child(slot) {
-                Some(Child::Node(child)) if is_open(node, slot, batch, node_open2) => {
-                    stack[depth] = brick.child_node(index, child) as u8;
-                    depth += 1;
+/// From where boxes are seen.
+#[derive(Clone, Copy, Debug)]
+enum Seen {
+    /// From a box on their own lattice.
+    From(LatticeBox),
+    /// From at least this far away, squared: the boxes are a prototype's, and this holds for all its instances.
+    FromAfar(f64),
+}
+
+/// The selection of one tree.
+struct Selection {
+    seen: Seen,
+    /// Squared angles below which bricks and nodes stay closed.
+    open2: [f32; 2],
+    /// Bricks of the next level.
+    next: Vec<u32>,
+    /// Roots of prototypes that have an open instance, each with the least squared distance on its lattice from which it is seen.
+    prototypes: BTreeMap<u32, f64>,
+}
+
+impl Selection {
+    /// Selects from the bricks of `level` down and loads what is selected. False when it did not fit.
+    fn open(&mut self, mut level: Vec<u32>, arena: &mut Arena, cut: &mut Cut) -> Result<bool> {
+        let mut fits = true;
+        while !level.is_empty() {
+            level.sort_unstable();
+            arena.add_to_cut(&level);
+            cut.bricks.extend_from_slice(&level);
+            let mut rest = level.as_slice();
+            while !rest.is_empty() {
+                let mut loaded = arena.load(rest)?;
+                if loaded == 0 {
+                    // The cut is larger than the arena: go on selecting with what comes in now
+                    fits = false;
+                    arena.release();
+                    loaded = arena.load(rest)?.max(1);
                 }
-                Some(Child::Brick(child)) if is_open(node, slot, batch, brick_open2) => {
-                    next.push(brick.child_brick_at(index, child));
+                for &number in &rest[..loaded] {
+                    cut.bytes += u64::from(arena.map().brick_bytes(number));
+                    let Some(brick) = arena.brick(number) else { continue };
+                    self.open_children(&brick);
                 }
-                _ => {}
+                rest = &rest[loaded..];
+            }
+            level.clear();
+            std::mem::swap(&mut level, &mut self.next);
+        }
+        Ok(fits)
+    }
+
+    /// Adds the child bricks that are to be opened to `next`, and the prototypes of instances to `prototypes`.
+    fn open_children(&mut self, brick: &Brick<'_>) {
+        let [brick_open2, node_open2] = self.open2;
+        let mut stack = [0_u8; 256];
+        let mut depth = 1;
+        while depth > 0 {
+            depth -= 1;
+            let index = usize::from(stack[depth]);
+            let node = brick.node(index);
+            for slot in 0..usize::from(node.count) {
+                match node.child(slot) {
+                    Some(Child::Node(child)) if self.is_open(node, slot, node_open2) => {
+                        stack[depth] = brick.child_node(index, child) as u8;
+                        depth += 1;
+                    }
+                    Some(Child::Brick(child)) if self.is_open(node, slot, brick_open2) => {
+                        self.next.push(brick.child_brick_at(index, child));
+                    }
+                    Some(Child::Instance(child)) if self.is_open(node, slot, brick_open2) => {
+                        let instance = Instance::read(brick.at(index, child));
+                        let distance2 = self.distance2(&node.child_box(slot));
+                        self.add_prototype(instance.brick, instance.distance2_inside(distance2));
+                    }
+                    _ => {}
+                }
             }
         }
     }
-}
 
-/// Whether a child's diagonal is seen from the batch under at least the angle whose square is `open2`.
-/// A child that must be opened always is.
-fn is_open(node: &Node, slot: usize, batch: &LatticeBox, open2: f32) -> bool {
-    if far::must_open(&node.far[slot]) {
-        return true;
+    /// Notes that a prototype is seen from a squared distance.
+    fn add_prototype(&mut self, root: u32, distance2: f64) {
+        let least = self.prototypes.entry(root).or_insert(distance2);
+        *least = least.min(distance2);
     }
-    let child = node.child_box(slot);
-    let gap = (child.min - batch.max).max(batch.min - child.max).max(IVec3::ZERO).as_dvec3();
-    let diagonal = (child.max - child.min).as_dvec3();
-    diagonal.length_squared() >= f64::from(open2) * gap.length_squared()
+
+    /// The squared distance of a box, at least.
+    fn distance2(&self, bounds: &LatticeBox) -> f64 {
+        match &self.seen {
+            Seen::From(batch) => {
+                let gap = (bounds.min - batch.max).max(batch.min - bounds.max).max(IVec3::ZERO);
+                gap.as_dvec3().length_squared()
+            }
+            Seen::FromAfar(distance2) => *distance2,
+        }
+    }
+
+    /// Whether a child's diagonal is seen under at least the angle whose square is `open2`. A child that must be opened always is.
+    fn is_open(&self, node: &Node, slot: usize, open2: f32) -> bool {
+        let child = node.child_box(slot);
+        let diagonal = (child.max - child.min).as_dvec3();
+        far::must_open(&node.far[slot])
+            || diagonal.length_squared() >= f64::from(open2) * self.distance2(&child)
+    }
 }
 
 #[cfg(test)]

@@ -53,6 +53,28 @@ pub trait MicrogridStream: Send {
     }
 }
 
+impl<S: MicrogridStream + ?Sized> MicrogridStream for &mut S {
+    fn schema(&self) -> &Schema {
+        (**self).schema()
+    }
+
+    fn rewind(&mut self) -> Result<()> {
+        (**self).rewind()
+    }
+
+    fn next(&mut self, grid: &mut Microgrid) -> Result<bool> {
+        (**self).next(grid)
+    }
+
+    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+        (**self).next_piece()
+    }
+
+    fn progress(&self) -> f64 {
+        (**self).progress()
+    }
+}
+
 impl<S: MicrogridStream + ?Sized> MicrogridStream for Box<S> {
     fn schema(&self) -> &Schema {
         (**self).schema()

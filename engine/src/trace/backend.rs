@@ -51,6 +51,14 @@ impl Backend {
         if device == Device::Cpu {
             return on_cpu("the CPU was asked for".into());
         }
+        if map.manifest().instances > 0 {
+            let why = "the occluders have copies that share bricks, which GPUs do not trace";
+            return match device {
+                Device::Auto => on_cpu(format!("the CPU traces, since {why}")),
+                _ => Err(crate::Error::unsupported(format!("device `{device}`: {why}"))
+                    .hint("use `--device cpu` or `--device auto`")),
+            };
+        }
         #[cfg(feature = "gpu")]
         {
             let chosen = super::gpu::choose(device)?;

@@ -47,14 +47,14 @@ pub struct Root {
     /// Sums over all its faces.
     pub moments: Moments,
     /// Its box, which the lines were shot through.
-    low: [i32; 3],
-    high: [i32; 3],
+    pub(super) low: [i32; 3],
+    pub(super) high: [i32; 3],
     /// What each of [`Directions::many`] lost, 0 to 1.
-    lost: [[f32; 16]; 4],
+    pub(super) lost: [[f32; 16]; 4],
     /// A plate for all of it, if it is a sheet: the normal's code, and the range along it from the box's centre.
-    plate: Option<([i8; 2], f32, f32)>,
+    pub(super) plate: Option<([i8; 2], f32, f32)>,
     /// Whether it must be opened.
-    must_open: bool,
+    pub(super) must_open: bool,
 }
 
 /// What a node passes on to its children.

@@ -19,6 +19,7 @@ pub mod shapes;
 pub mod shoot;
 #[cfg(test)]
 mod tests;
+pub mod top;
 
 use std::str::FromStr;
 

@@ -35,6 +35,20 @@ pub trait MatrixSource: Send {
     }
 }
 
+impl<M: MatrixSource + ?Sized> MatrixSource for &mut M {
+    fn rewind(&mut self) -> Result<()> {
+        (**self).rewind()
+    }
+
+    fn next(&mut self) -> Result<Option<DMat4>> {
+        (**self).next()
+    }
+
+    fn progress(&self) -> f64 {
+        (**self).progress()
+    }
+}
+
 /// Matrices in memory.
 #[derive(Clone, Debug)]
 pub struct MatrixList {

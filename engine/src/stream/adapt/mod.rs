@@ -13,6 +13,7 @@ pub use concat::Concat;
 pub use convert::Convert;
 pub use displace::{Displace, Displacement};
 pub use instance::{Instance, MatrixList, MatrixSource, PROTOTYPE_BYTES_MAX};
+pub(crate) use place::{Placement, cube_root};
 
 #[cfg(test)]
 mod tests;

@@ -8,7 +8,7 @@ use crate::{Error, Result};
 
 /// An affine map, prepared for many grids.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Placement {
+pub struct Placement {
     matrix: DMat4,
     linear: DMat3,
     normal: DMat3,
@@ -132,7 +132,7 @@ impl Piece for PlacedPiece {
 
 /// The columns that a map changes besides positions.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct PlacedColumns {
+pub struct PlacedColumns {
     normal: Option<(usize, ValueType)>,
     radius: Option<(usize, ValueType)>,
 }
@@ -192,7 +192,7 @@ fn push(value_type: ValueType, value: f32, out: &mut Vec<u8>) {
 }
 
 /// The cube root of a positive number by Newton's method: `f64::cbrt` may differ in the last bit between machines.
-fn cube_root(x: f64) -> f64 {
+pub fn cube_root(x: f64) -> f64 {
     // A third of the exponent gives a start within 20 %; the error then squares with every step.
     let mut root = f64::from_bits(x.to_bits() / 3 + (0x3ff0_0000_0000_0000 / 3) * 2);
     for _ in 0..6 {

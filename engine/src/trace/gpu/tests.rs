@@ -166,7 +166,7 @@ fn scene(folder: &Path, far_field: FarField) -> (Arc<BrickMap>, Vec<Point>) {
     let options =
         BuildOptions { memory_bytes: 256 << 20, threads: 2, scratch: folder.join("scratch"), far_field };
     std::fs::create_dir_all(&options.scratch).unwrap();
-    let mut streams = [OccluderStream { stream: &mut jungle }, OccluderStream { stream: &mut mixed }];
+    let mut streams = [OccluderStream::once(&mut jungle), OccluderStream::once(&mut mixed)];
     build(&mut streams, &options, &folder.join("map"), &|_, _| {}, &AtomicBool::new(false)).unwrap();
     let mut grid = Microgrid::default();
     let mut points = Vec::new();
