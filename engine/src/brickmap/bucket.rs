@@ -66,7 +66,7 @@ impl Cells {
     /// tree. Returns their counts.
     pub fn partition(&mut self, micropolygons_max: u64) -> Vec<u64> {
         let mut order: Vec<u32> =
-            (0..SLOTS as u32).filter(|&slot| self.slots[slot as usize].count > 0).collect();
+            (0..self.slots.len() as u32).filter(|&slot| self.slots[slot as usize].count > 0).collect();
         order.sort_unstable_by_key(|&slot| self.slots[slot as usize].key.to_array());
         let mut counts = Vec::new();
         // An explicit stack of ranges, right halves below left ones
@@ -102,6 +102,21 @@ impl Cells {
         counts
     }
 
+    /// Gives back the memory of slots that are not needed; nothing can be counted any more.
+    pub fn shrink(&mut self) {
+        let slots = vec![FREE; (2 * self.occupied).next_power_of_two()];
+        let old = std::mem::replace(&mut self.slots, slots);
+        for cell in old.into_iter().filter(|cell| cell.count > 0) {
+            let slot = self.slot(cell.key);
+            self.slots[slot] = cell;
+        }
+    }
+
+    /// Bytes in memory.
+    pub fn memory_bytes(&self) -> u64 {
+        size_of_val(&self.slots[..]) as u64
+    }
+
     /// The partition of a position that was counted.
     pub fn partition_of(&self, position: DVec3) -> Option<usize> {
         let cell = self.slots[self.slot(self.key(position))];
@@ -118,9 +133,9 @@ impl Cells {
             .to_array()
             .iter()
             .fold(0_u64, |hash, &k| (hash ^ k as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29));
-        let mut slot = (mixed >> 20) as usize % SLOTS;
+        let mut slot = (mixed >> 20) as usize % self.slots.len();
         while self.slots[slot].count > 0 && self.slots[slot].key != key {
-            slot = (slot + 1) % SLOTS;
+            slot = (slot + 1) % self.slots.len();
         }
         slot
     }
@@ -167,7 +182,12 @@ mod tests {
         assert_eq!(counts.iter().sum::<u64>(), 1_200_000);
         assert!(counts.iter().all(|&count| count <= 50_000) && counts.len() < 80, "{}", counts.len());
         let mut found = vec![0; counts.len()];
+        cells.shrink();
         points.iter().for_each(|&point| found[cells.partition_of(point).unwrap()] += 3);
         assert_eq!(found, counts);
+        let mut few = Cells::new(0);
+        few.add(DVec3::ZERO, 7);
+        few.shrink();
+        assert!(few.memory_bytes() < 200 && few.partition(1) == [7]);
     }
 }

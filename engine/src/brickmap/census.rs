@@ -23,6 +23,7 @@ const QUADS_MEASURED: usize = 16;
 pub(super) type Edges = [u64; 128];
 
 /// What pass 1 finds.
+#[derive(Debug)]
 pub struct Census {
     /// Micropolygons by place.
     pub cells: Cells,

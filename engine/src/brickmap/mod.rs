@@ -171,8 +171,9 @@ pub fn build(
 
     // What shares bricks, and what is expanded
     let start = Instant::now();
-    let prototypes = find_prototypes(occluders, &job)?;
-    let is_shared = |number: usize| prototypes.iter().any(|prototype| prototype.occluder == number);
+    let mut prototypes = find_prototypes(occluders, &job)?;
+    let shares: Vec<usize> = prototypes.iter().map(|prototype| prototype.occluder).collect();
+    let is_shared = |number: usize| shares.contains(&number);
 
     // Pass 1: count what is expanded
     let mut numbers = Vec::new();
@@ -208,8 +209,8 @@ pub fn build(
     // The prototypes, pass 2 and the partitions, the tree over all
     let done = (|| {
         let mut first = 0;
-        for stream in shared {
-            first = build_prototype(stream, first, &mut output, &job, &mut report)?;
+        for (prototype, stream) in prototypes.iter_mut().zip(shared) {
+            first = build_prototype(prototype, stream, first, &mut output, &job, &mut report)?;
         }
         let whole = (first, partitions);
         fill_and_build(&mut flat, census, (&lattice, &shifts), whole, &mut output, &job, &mut report)?;
@@ -275,9 +276,11 @@ pub fn build(
 /// The geometries whose copies share bricks, in their order.
 fn find_prototypes(occluders: &mut [OccluderStream<'_>], job: &Job<'_>) -> Result<Vec<Prototype>> {
     let (mut prototypes, mut taken) = (Vec::new(), 0);
+    let mut memory_bytes = job.options.memory_bytes / 16;
     for occluder in occluders.iter_mut().enumerate() {
-        if let Some(prototype) = Prototype::judge(occluder, taken, job)? {
+        if let Some(mut prototype) = Prototype::judge(occluder, taken, job)? {
             taken += prototype.copies();
+            memory_bytes = prototype.keep_census(memory_bytes);
             prototypes.push(prototype);
         }
     }
@@ -294,14 +297,15 @@ fn map_lattice(census: &Census, prototypes: &[Prototype]) -> Result<Lattice> {
 /// Builds a prototype whose partitions are numbered from `first` on, as far as it is not written yet. Returns the number that
 /// comes after it.
 fn build_prototype(
+    prototype: &mut Prototype,
     stream: &mut dyn MicrogridStream,
     first: usize,
     output: &mut Output,
     job: &Job<'_>,
     report: &mut BuildReport,
 ) -> Result<usize> {
+    let mut census = prototype.take_census(stream, job)?;
     let mut own = [OccluderStream::once(stream)];
-    let mut census = census::count(&mut own, job)?;
     let (lattice, partitions) = (census.lattice()?, census.cells.partition(PARTITION_MICROPOLYGONS).len());
     let top = first + partitions;
     if output.partitions <= top {

@@ -16,6 +16,7 @@ use super::{Job, OccluderStream};
 use crate::brick::lattice::exp2;
 use crate::brick::{Instance, Lattice, LatticeBox};
 use crate::math::Bounds;
+use crate::stream::MicrogridStream;
 use crate::stream::adapt::{MatrixSource, Placement, cube_root};
 use crate::{Error, Result};
 
@@ -40,6 +41,8 @@ pub struct Prototype {
     pub content: u128,
     /// Microgrids.
     pub grids: u64,
+    /// What pass 1 has counted; none where that would take too much memory, so that it is counted once more.
+    census: Option<Census>,
 }
 
 /// A copy on the map's lattice.
@@ -98,8 +101,9 @@ impl Prototype {
         let mut content = xxhash_rust::xxh3::Xxh3::new();
         content.update(&census.content.to_le_bytes());
         matrices.iter().for_each(|matrix| content.update(bytemuck::cast_slice(&matrix.to_cols_array())));
-        let (lattice, bounds, grids) = (census.lattice()?, census.bounds, census.grids);
-        let prototype = Self { occluder, matrices, lattice, bounds, content: content.digest128(), grids };
+        let (lattice, bounds, grids, content) =
+            (census.lattice()?, census.bounds, census.grids, content.digest128());
+        let prototype = Self { occluder, matrices, lattice, bounds, content, grids, census: Some(census) };
         Ok(prototype.can_be_stored().then_some(prototype))
     }
 
@@ -110,6 +114,30 @@ impl Prototype {
             let largest = linear.to_cols_array().iter().fold(0.0_f64, |largest, x| largest.max(x.abs()));
             largest < exp2(6) && Instance::new(0, linear, DVec3::ZERO).is_some()
         })
+    }
+
+    /// Keeps what was counted, in less memory, if that takes at most `memory_bytes`. Returns how much is left of them.
+    pub fn keep_census(&mut self, memory_bytes: u64) -> u64 {
+        let Some(census) = &mut self.census else { return memory_bytes };
+        census.cells.shrink();
+        match memory_bytes.checked_sub(census.cells.memory_bytes()) {
+            Some(left) => left,
+            None => {
+                self.census = None;
+                memory_bytes
+            }
+        }
+    }
+
+    /// What was counted, to be used once; counts again where it was not kept.
+    ///
+    /// # Errors
+    /// As the first count.
+    pub fn take_census(&mut self, stream: &mut dyn MicrogridStream, job: &Job<'_>) -> Result<Census> {
+        match self.census.take() {
+            Some(census) => Ok(census),
+            None => census::count(&mut [OccluderStream::once(stream)], job),
+        }
     }
 
     /// How many copies.
