@@ -76,7 +76,7 @@ fn build_scene(origin: DVec3, shares: bool, machine: &Machine, target: &Path) ->
     if shares {
         let mut occluders = vec![OccluderStream::once(&mut ground)];
         for (stream, matrices) in &mut sources {
-            occluders.push(OccluderStream { stream, instances: Some(matrices) });
+            occluders.push(OccluderStream { stream, instances: Some(matrices), continues: false });
         }
         return build(&mut occluders, &options, target, &progress, &cancel).map(|_| ());
     }

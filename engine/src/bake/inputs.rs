@@ -2,14 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
+use super::copies::{Matrices, Product};
 use super::folder::write_atomically;
 use crate::dice::Rate;
 use crate::import::{ImportOptions, ImportReport, Part, Parts, SavedParts, import_parts, is_importable};
-use crate::scene::instances::InstanceReader;
 use crate::scene::{Geometry, Instances, Scene, StreamSource};
 use crate::stream::MicrogridStream;
 use crate::stream::adapt::{Concat, Convert, Instance, MatrixSource};
@@ -174,11 +173,33 @@ impl Inputs {
         })
     }
 
-    /// The stream of a geometry as it stands before the scene copies it, and where it does; none where it stands once.
+    /// A geometry in parts, each as it stands before the scene and its file copy it, and where it does.
     ///
     /// # Errors
     /// When a file cannot be opened.
-    pub(super) fn open_prototype(
+    pub(super) fn open_parts(&self, scene: &Scene, geometry: usize) -> Result<Vec<OpenPart>> {
+        let [Some(Parts { parts, .. })] = &self.files[geometry][..] else {
+            let (stream, copies) = self.open_prototype(scene, geometry)?;
+            let copies = copies.map(|copies| Box::new(copies) as Box<dyn MatrixSource>);
+            return Ok(vec![OpenPart { stream, copies }]);
+        };
+        let instances = &scene.geometries[geometry].instances;
+        let open = |Part { file, copies }: &Part| {
+            // What has copies was imported, in the scene's units and axes
+            let stream = Convert::to_units(MgsReader::open(file)?, scene.meters_per_unit, scene.up)?;
+            let copies: Option<Box<dyn MatrixSource>> = match (copies, instances.is_empty()) {
+                (None, true) => None,
+                (None, false) => Some(Box::new(Matrices::new(instances))),
+                (Some(inner), true) => Some(Box::new(inner.clone())),
+                (Some(inner), false) => Some(Box::new(Product::new(Matrices::new(instances), inner.clone()))),
+            };
+            Ok(OpenPart { stream: Box::new(stream), copies })
+        };
+        parts.iter().map(open).collect()
+    }
+
+    /// The stream of a geometry as it stands before the scene copies it, and where it does; none where it stands once.
+    fn open_prototype(
         &self,
         scene: &Scene,
         geometry: usize,
@@ -206,41 +227,12 @@ impl Inputs {
     }
 }
 
-/// A geometry's copies as the instance adapter reads them: inline matrices and files, one after the other.
-pub(super) struct Matrices {
-    instances: Vec<Instances>,
-    next: usize,
-    reader: Option<InstanceReader>,
-}
-
-impl Matrices {
-    fn new(instances: &[Instances]) -> Self {
-        Self { instances: instances.to_vec(), next: 0, reader: None }
-    }
-}
-
-impl MatrixSource for Matrices {
-    fn rewind(&mut self) -> Result<()> {
-        (self.next, self.reader) = (0, None);
-        Ok(())
-    }
-
-    fn next(&mut self) -> Result<Option<DMat4>> {
-        loop {
-            if let Some(reader) = &mut self.reader {
-                if let Some(matrix) = reader.next()? {
-                    return Ok(Some(matrix));
-                }
-                self.reader = None;
-            }
-            let Some(instances) = self.instances.get(self.next) else { return Ok(None) };
-            self.next += 1;
-            match instances {
-                Instances::Matrix(matrix) => return Ok(Some(*matrix)),
-                Instances::File(path) => self.reader = Some(InstanceReader::open(path)?),
-            }
-        }
-    }
+/// A part of a geometry.
+pub(super) struct OpenPart {
+    /// In the scene's units and axes.
+    pub stream: Box<dyn MicrogridStream>,
+    /// World from object for every copy; none where it stands once, as it is.
+    pub copies: Option<Box<dyn MatrixSource>>,
 }
 
 /// Adds files, and where they stand, to a hash.

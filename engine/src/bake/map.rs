@@ -74,15 +74,17 @@ pub fn build_if_missing(
     if target.join("manifest.json").exists() {
         return Ok(None);
     }
-    let mut opened = geometries
-        .iter()
-        .map(|&geometry| inputs.open_prototype(scene, geometry))
-        .collect::<Result<Vec<_>>>()?;
+    let mut opened = Vec::new();
+    for &geometry in geometries {
+        let parts = inputs.open_parts(scene, geometry)?;
+        opened.extend(parts.into_iter().enumerate().map(|(number, part)| (number > 0, part)));
+    }
     let mut occluders: Vec<OccluderStream<'_>> = opened
         .iter_mut()
-        .map(|(stream, copies)| OccluderStream {
-            stream: stream.as_mut(),
-            instances: copies.as_mut().map(|copies| copies as &mut dyn MatrixSource),
+        .map(|(continues, part)| OccluderStream {
+            stream: part.stream.as_mut(),
+            instances: part.copies.as_mut().map(|copies| copies.as_mut() as &mut dyn MatrixSource),
+            continues: *continues,
         })
         .collect();
     let progress = |stage: &str, done: f64| control.progress.update(stage, done, "");

@@ -25,6 +25,7 @@ mod log;
 mod output;
 pub mod pack;
 mod partition;
+mod parts;
 mod sah;
 mod shared;
 pub mod spill;
@@ -41,6 +42,7 @@ pub use file::{BrickMap, FORMAT_VERSION, Manifest, SegmentSource};
 use log::Spill;
 use output::Output;
 use pack::ByteSplit;
+use parts::{geometries_of, unite_shifts};
 use shared::Prototype;
 pub use writer::{is_unfinished, unfinished_path};
 
@@ -60,12 +62,14 @@ pub struct OccluderStream<'a> {
     /// World from object for every copy; none where the stream stands once, as it is. Whether copies share bricks is decided by
     /// a rule ([`shared`]).
     pub instances: Option<&'a mut dyn MatrixSource>,
+    /// Whether it is one more part of the geometry that the stream before it belongs to.
+    pub continues: bool,
 }
 
 impl<'a> OccluderStream<'a> {
-    /// A stream that stands once, as it is.
+    /// A geometry that stands once, as it is.
     pub fn once(stream: &'a mut dyn MicrogridStream) -> Self {
-        Self { stream, instances: None }
+        Self { stream, instances: None, continues: false }
     }
 }
 
@@ -174,6 +178,7 @@ pub fn build(
     let mut prototypes = find_prototypes(occluders, &job)?;
     let shares: Vec<usize> = prototypes.iter().map(|prototype| prototype.occluder).collect();
     let is_shared = |number: usize| shares.contains(&number);
+    let occluder_geometries = geometries_of(occluders);
 
     // Pass 1: count what is expanded
     let mut numbers = Vec::new();
@@ -194,7 +199,8 @@ pub fn build(
     let mut census = census::count(&mut flat, &job)?;
     report.grids = census.grids + prototypes.iter().map(|prototype| prototype.grids).sum::<u64>();
     let lattice = map_lattice(&census, &prototypes)?;
-    let shifts = census.shifts(&lattice);
+    let mut shifts = census.shifts(&lattice);
+    let geometry_shifts = unite_shifts(&mut shifts, &numbers, &shares, occluder_geometries);
     let partitions = census.cells.partition(PARTITION_MICROPOLYGONS).len();
     report.count_seconds = start.elapsed().as_secs_f64();
 
@@ -202,6 +208,7 @@ pub fn build(
     let mut content = xxhash_rust::xxh3::Xxh3::new();
     content.update(&census.content.to_le_bytes());
     prototypes.iter().for_each(|prototype| content.update(&prototype.content.to_le_bytes()));
+    content.update(bytemuck::cast_slice(&shifts));
     content.update(parameters(options).as_bytes());
     let mut output = Output::open(target, content.digest128())?;
     report.continued_partitions = output.partitions;
@@ -236,14 +243,12 @@ pub fn build(
     };
 
     // The manifest
-    let mut all_shifts = vec![0; numbers.len() + prototypes.len()];
-    numbers.iter().zip(&shifts).for_each(|(&number, &shift)| all_shifts[number] = shift);
     let Output { writer, split, skipped, leaves, .. } = output;
     let manifest = Manifest {
         version: FORMAT_VERSION,
         lattice_exponent: lattice.exponent,
         lattice_origin: lattice.origin.to_array(),
-        shifts: all_shifts,
+        shifts: geometry_shifts,
         low: root.bounds.min.to_array(),
         high: root.bounds.max.to_array(),
         bricks: writer.bricks(),

@@ -93,7 +93,7 @@ impl Prototype {
         if matrices.len() < 2 {
             return Ok(None);
         }
-        let mut own = [OccluderStream { stream: &mut *stream.stream, instances: None }];
+        let mut own = [OccluderStream::once(&mut *stream.stream)];
         let census = census::count(&mut own, job)?;
         if census.faces() * (matrices.len() as u64) < MICROPOLYGONS_MIN {
             return Ok(None);
