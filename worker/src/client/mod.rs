@@ -10,6 +10,7 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use protocol::Problem;
@@ -43,6 +44,8 @@ pub struct Client {
     base: String,
     token: Option<String>,
     patience: Duration,
+    /// Bytes of objects that came, over all clones.
+    received: Arc<AtomicU64>,
 }
 
 /// A reply that is not the end.
@@ -74,7 +77,7 @@ impl Client {
             .user_agent(concat!("pantaray/", env!("CARGO_PKG_VERSION")))
             .build();
         let (base, token) = (url.trim_end_matches('/').to_owned(), token.map(str::to_owned));
-        Ok(Self { agent: config.into(), base, token, patience })
+        Ok(Self { agent: config.into(), base, token, patience, received: Arc::default() })
     }
 
     /// The same coordinator with another patience.
@@ -85,6 +88,11 @@ impl Client {
     /// The same coordinator for somebody else.
     pub fn with_token(&self, token: &str) -> Self {
         Self { token: Some(token.into()), ..self.clone() }
+    }
+
+    /// Bytes of objects that came so far.
+    pub fn received_bytes(&self) -> u64 {
+        self.received.load(Ordering::Relaxed)
     }
 
     /// The coordinator's URL.
@@ -173,6 +181,7 @@ impl Client {
             let mut body = reply.into_body();
             let announced = body.content_length();
             let content = store(&mut body.with_config().limit(bytes_max).reader(), path)?;
+            client.received.fetch_add(content.bytes, Ordering::Relaxed);
             match announced {
                 Some(bytes) if bytes != content.bytes => Err(Failure::Trouble(Trouble {
                     message: format!("the transfer ended after {} of {bytes} bytes", content.bytes),
@@ -203,7 +212,9 @@ impl Client {
                     retry_after: None,
                 })
             };
-            reply.body_mut().as_reader().read_exact(out).map_err(broke_off)
+            reply.body_mut().as_reader().read_exact(out).map_err(broke_off)?;
+            client.received.fetch_add(out.len() as u64, Ordering::Relaxed);
+            Ok(())
         })
     }
 
@@ -335,10 +346,12 @@ impl From<Error> for Failure {
 /// must, which is no fault of the worker.
 fn blame_storage(url: &ObjectUrl, failure: Failure) -> Failure {
     match failure {
-        Failure::End(Error::Refused(problem)) if !url.url.starts_with('/') => Failure::End(match problem.status {
-            403 | 404 => Error::Refused(problem),
-            _ => Error::Unreachable(format!("storage: {} ({})", problem.detail, problem.status)),
-        }),
+        Failure::End(Error::Refused(problem)) if !url.url.starts_with('/') => {
+            Failure::End(match problem.status {
+                403 | 404 => Error::Refused(problem),
+                _ => Error::Unreachable(format!("storage: {} ({})", problem.detail, problem.status)),
+            })
+        }
         failure => failure,
     }
 }
