@@ -1,5 +1,6 @@
 //! How a coordinator is set up.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::Path;
 
@@ -15,8 +16,10 @@ pub struct Settings {
     pub database: String,
     /// Connections to the database at most.
     pub connections: u32,
-    /// Where objects are: a folder, or a URL such as `s3://bucket`.
+    /// Where objects are: a folder, or a URL such as `s3://bucket/prefix`.
     pub storage: String,
+    /// The storage provider's options, such as `aws_endpoint`, besides those of the environment.
+    pub storage_options: BTreeMap<String, String>,
     /// Folders that scenes may name as `root:NAME/path`.
     pub roots: Roots,
     /// Whether requests without a token may do everything: only for one machine's own use.
@@ -35,6 +38,7 @@ impl Settings {
             database: format!("sqlite:{}", folder.join("pantaray.db").display()),
             connections: 32,
             storage: folder.join("storage").display().to_string(),
+            storage_options: BTreeMap::new(),
             roots: Roots::new(),
             without_tokens: false,
             lease_ttl_ms: limits::LEASE_TTL_MS,

@@ -1,6 +1,9 @@
 //! Objects: a local folder, or S3, Google Cloud Storage or Azure. Keys come from [`protocol::keys`]; an object appears
 //! whole or not at all.
 
+mod cloud;
+
+use std::collections::BTreeMap;
 use std::path::Path as FilePath;
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,11 +11,11 @@ use std::time::Duration;
 use axum::body::{Body, Bytes};
 use futures_util::{StreamExt, TryStreamExt};
 use object_store::path::Path;
-#[cfg(feature = "cloud")]
-use object_store::signer::Signer;
 use object_store::{GetOptions, GetRange, ObjectMeta, ObjectStore, ObjectStoreExt, WriteMultipart};
+use protocol::storage::ObjectUrl;
 use sha2::{Digest, Sha256};
 
+use self::cloud::Cloud;
 use crate::error::Kind;
 use crate::{Error, Result};
 
@@ -21,13 +24,19 @@ const SMALL_BYTES_MAX: u64 = 64 << 20;
 /// Parts of one upload that are on their way to storage at once.
 const PARTS_IN_FLIGHT: usize = 4;
 
+/// Bytes of a part of an upload at least; larger ones where there would be more parts than storage takes.
+const PART_BYTES_MIN: u64 = 8 << 20;
+/// Parts of an upload at most.
+const PARTS_MAX: u64 = 9_000;
+/// Time that storage has to show itself when it is opened.
+const FIRST_ANSWER: Duration = Duration::from_secs(30);
+
 /// Where objects are.
 #[derive(Clone, Debug)]
 pub struct Storage {
     store: Arc<dyn ObjectStore>,
     /// Signs URLs; none for a local folder, whose bytes go through the coordinator.
-    #[cfg(feature = "cloud")]
-    signer: Option<Arc<dyn Signer>>,
+    cloud: Option<Cloud>,
 }
 
 /// What an upload must turn out to be.
@@ -52,78 +61,59 @@ pub struct Outgoing {
 }
 
 impl Storage {
-    /// Opens a folder, which is made if need be, or the storage at a URL such as `s3://bucket/prefix`.
+    /// Opens a folder, which is made if need be, or the storage at a URL such as `s3://bucket/prefix`. `options` are those
+    /// of the provider, called as in the environment: `aws_endpoint` and so on.
     ///
     /// # Errors
-    /// When the folder cannot be made, or the URL is not understood.
-    pub fn open(place: &str) -> Result<Self> {
+    /// When the folder cannot be made, or the URL or an option is not understood.
+    pub fn open(place: &str, options: &BTreeMap<String, String>) -> Result<Self> {
         if place.contains("://") {
-            return Self::open_cloud(place);
+            return cloud::open(place, options);
         }
         std::fs::create_dir_all(place)?;
         let folder = FilePath::new(place).canonicalize()?;
         let local = object_store::local::LocalFileSystem::new_with_prefix(folder)?;
         let local = local.with_fsync(true).with_automatic_cleanup(true);
-        Ok(Self {
-            store: Arc::new(local),
-            #[cfg(feature = "cloud")]
-            signer: None,
-        })
+        Ok(Self { store: Arc::new(local), cloud: None })
     }
 
-    #[cfg(not(feature = "cloud"))]
-    fn open_cloud(place: &str) -> Result<Self> {
-        Err(Error::invalid(format!("this program was built without support for `{place}`"))
-            .hint("build it with `--features cloud`, or give a folder"))
+    /// Looks whether storage answers: wrong credentials or a bucket that is not there are better known at once.
+    ///
+    /// # Errors
+    /// [`Kind::Invalid`] with the storage's own words.
+    pub async fn probe(&self) -> Result<()> {
+        let mut found = self.store.list(Some(&Path::from("assets")));
+        let answer = tokio::time::timeout(FIRST_ANSWER, found.next()).await;
+        let words = match answer {
+            Ok(None | Some(Ok(_))) => return Ok(()),
+            Ok(Some(Err(error))) => error.to_string(),
+            Err(_) => "no answer".into(),
+        };
+        Err(Error::invalid(format!("storage cannot be used: {words}"))
+            .hint("are bucket, endpoint and credentials right, and may they list, read, write and delete?"))
     }
 
-    #[cfg(feature = "cloud")]
-    fn open_cloud(place: &str) -> Result<Self> {
-        use object_store::aws::AmazonS3Builder;
-        use object_store::azure::MicrosoftAzureBuilder;
-        use object_store::gcp::GoogleCloudStorageBuilder;
-
-        let bucket = place.split("://").nth(1).unwrap_or_default();
-        if bucket.trim_end_matches('/').contains('/') {
-            // A signer knows the bucket only: keys begin at its root
-            return Err(Error::invalid(format!("`{place}` names more than a bucket"))
-                .hint("give it a bucket of its own"));
-        }
-        match place.split("://").next().unwrap_or_default() {
-            "s3" | "s3a" => Ok(Self::signing(AmazonS3Builder::from_env().with_url(place).build()?)),
-            "gs" => Ok(Self::signing(GoogleCloudStorageBuilder::from_env().with_url(place).build()?)),
-            "az" | "azure" | "abfs" | "abfss" => {
-                Ok(Self::signing(MicrosoftAzureBuilder::from_env().with_url(place).build()?))
-            }
-            other => {
-                Err(Error::invalid(format!("`{other}` is no storage that is known"))
-                    .hint("`s3`, `gs` or `az`"))
-            }
-        }
-    }
-
-    #[cfg(feature = "cloud")]
-    fn signing<S: ObjectStore + Signer>(store: S) -> Self {
-        let store = Arc::new(store);
-        Self { store: store.clone(), signer: Some(store) }
-    }
-
-    /// A URL at which the object can be read or written without us; none for a local folder.
+    /// A URL at which the object can be read without us; none for a local folder.
     ///
     /// # Errors
     /// When it cannot be signed.
-    #[cfg(feature = "cloud")]
-    pub async fn url(&self, put: bool, key: &str, ttl: Duration) -> Result<Option<String>> {
-        let Some(signer) = &self.signer else { return Ok(None) };
-        let method = if put { axum::http::Method::PUT } else { axum::http::Method::GET };
-        Ok(Some(signer.signed_url(method, &path(key)?, ttl).await?.to_string()))
+    pub async fn get_url(&self, key: &str, ttl: Duration) -> Result<Option<ObjectUrl>> {
+        let Some(cloud) = &self.cloud else { return Ok(None) };
+        cloud.get_url(&path(key)?, ttl).await.map(Some)
     }
 
-    /// A URL at which the object can be read or written without us: this program knows local folders only.
-    #[cfg(not(feature = "cloud"))]
-    #[expect(clippy::unused_async, clippy::missing_errors_doc, reason = "as the one above")]
-    pub async fn url(&self, _put: bool, _key: &str, _ttl: Duration) -> Result<Option<String>> {
-        Ok(None)
+    /// A URL at which the object can be written without us; none for a local folder, or where it is too large for that.
+    ///
+    /// # Errors
+    /// When it cannot be signed.
+    pub async fn put_url(
+        &self,
+        key: &str,
+        expected: Expected<'_>,
+        ttl: Duration,
+    ) -> Result<Option<ObjectUrl>> {
+        let Some(cloud) = &self.cloud else { return Ok(None) };
+        cloud.put_url(&path(key)?, expected, ttl).await
     }
 
     /// Writes a small object.
@@ -166,7 +156,9 @@ impl Storage {
     /// # Errors
     /// [`Kind::Invalid`] where it is not, [`Kind::TooLarge`] beyond the limit.
     pub async fn receive(&self, key: &str, body: Body, expected: Expected<'_>) -> Result<u64> {
-        let mut upload = WriteMultipart::new(self.store.put_multipart(&path(key)?).await?);
+        let part_bytes = expected.bytes.unwrap_or(expected.bytes_max).div_ceil(PARTS_MAX).max(PART_BYTES_MIN);
+        let upload = self.store.put_multipart(&path(key)?).await?;
+        let mut upload = WriteMultipart::new_with_chunk_size(upload, part_bytes as usize);
         match receive(&mut upload, body, expected).await {
             Ok(bytes) => {
                 upload.finish().await?;
@@ -270,7 +262,7 @@ mod tests {
     #[tokio::test]
     async fn an_upload_appears_only_if_it_is_what_was_announced() {
         let folder = tempfile::tempdir().unwrap();
-        let storage = Storage::open(folder.path().to_str().unwrap()).unwrap();
+        let storage = Storage::open(folder.path().to_str().unwrap(), &BTreeMap::new()).unwrap();
         let cases = [
             (expected("ab", Some(2)), true),
             (expected("ab", Some(3)), false),
@@ -295,7 +287,7 @@ mod tests {
     #[tokio::test]
     async fn ranges_are_exact() {
         let folder = tempfile::tempdir().unwrap();
-        let storage = Storage::open(folder.path().to_str().unwrap()).unwrap();
+        let storage = Storage::open(folder.path().to_str().unwrap(), &BTreeMap::new()).unwrap();
         storage.put("k", "0123456789").await.unwrap();
         let outgoing = storage.send("k", Some(GetRange::Bounded(2..5))).await.unwrap();
         let bytes = axum::body::to_bytes(outgoing.body, 100).await.unwrap();

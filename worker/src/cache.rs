@@ -11,9 +11,11 @@
 //! An object with a second link is in use by a folder. When room is needed, objects without one go first, those used
 //! longest ago before others, then folders that nobody holds. A cache outlives its process: objects stay, the rest goes.
 
+mod disk;
+
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::os::unix::fs::{FileExt, MetadataExt};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -22,6 +24,8 @@ use std::time::SystemTime;
 use engine::ErrorKind;
 use protocol::storage::FolderFile;
 
+pub use self::disk::Scratch;
+use self::disk::{Object, in_progress, make_folder, objects, remove};
 use crate::depot::{Depot, Wanted};
 use crate::{Error, Result, digest};
 
@@ -70,25 +74,6 @@ pub struct Entry {
     pub bytes: Option<u64>,
 }
 
-/// A folder for work in progress, removed when it is dropped.
-#[derive(Debug)]
-pub struct Scratch(PathBuf);
-
-impl Scratch {
-    /// Where it is.
-    pub fn path(&self) -> &Path {
-        &self.0
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        if let Err(error) = fs::remove_dir_all(&self.0) {
-            tracing::warn!("cannot remove {}: {error}", self.0.display());
-        }
-    }
-}
-
 impl Cache {
     /// Opens the cache in `root`, which is made if it is not there, and holds it against other processes.
     ///
@@ -130,7 +115,7 @@ impl Cache {
         let number = self.scratches.fetch_add(1, Ordering::Relaxed);
         let path = self.root.join("scratch").join(number.to_string());
         make_folder(&path)?;
-        Ok(Scratch(path))
+        Ok(Scratch::new(path))
     }
 
     /// The folder called `name` with these entries; what is missing is fetched from `depot` and verified.
@@ -193,7 +178,7 @@ impl Cache {
             }
         }
         for chunk in missing.chunks(protocol::limits::URLS_MAX) {
-            self.make_room(chunk.iter().filter_map(|entry| entry.bytes).sum())?;
+            self.make_room(chunk.iter().filter_map(|entry| entry.bytes).sum(), 0)?;
             let wanted: Vec<Wanted> = chunk
                 .iter()
                 .map(|entry| Wanted {
@@ -222,7 +207,7 @@ impl Cache {
         if target.exists() {
             return Ok(());
         }
-        self.make_room(content.bytes)?;
+        self.make_room(content.bytes, content.bytes)?;
         make_folder(target.parent().unwrap_or(&self.root))?;
         match fs::hard_link(path, &target) {
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Ok(()),
@@ -281,7 +266,7 @@ impl Cache {
     /// # Errors
     /// When it does not fit or cannot be written.
     pub fn keep_block(&self, name: &str, bytes: &[u8]) -> engine::Result<()> {
-        self.make_room(bytes.len() as u64)?;
+        self.make_room(bytes.len() as u64, 0)?;
         let (path, scratch) = (self.block(name), self.scratch()?);
         let temporary = scratch.path().join("block");
         fs::write(&temporary, bytes).map_err(|error| engine::Error::io("write", &temporary, error))?;
@@ -315,8 +300,10 @@ impl Cache {
         self.root.join("objects").join("blocks").join(name)
     }
 
-    /// Makes room for so many bytes, and some more: finding what can go takes time.
-    fn make_room(&self, bytes: u64) -> engine::Result<()> {
+    /// Makes room for so many bytes, and some more: finding what can go takes time. Work in progress has precedence over
+    /// what is kept, and is not what a cache is too small for. `there` bytes of what is wanted are in progress as yet.
+    fn make_room(&self, wanted: u64, there: u64) -> engine::Result<()> {
+        let bytes = wanted + in_progress(&self.root).saturating_sub(there);
         let mut state = self.state();
         if state.bytes + bytes <= self.bytes_max {
             return Ok(());
@@ -339,8 +326,11 @@ impl Cache {
             }
             let unheld = state.folders.iter().filter(|(_, (folder, _))| Arc::strong_count(folder) == 1);
             let Some(name) = unheld.min_by_key(|(_, (_, used))| *used).map(|(name, _)| name.clone()) else {
+                if state.bytes + wanted <= self.bytes_max {
+                    return Ok(());
+                }
                 let message =
-                    format!("the cache of {} bytes is full, {bytes} more are needed", self.bytes_max);
+                    format!("the cache of {} bytes is full, {wanted} more are needed", self.bytes_max);
                 return Err(engine::Error::new(ErrorKind::Limit, message)
                     .at(&self.root)
                     .hint("give the worker more: `--cache-size`"));
@@ -361,30 +351,34 @@ impl Cache {
     }
 }
 
-struct Object {
-    path: PathBuf,
-    bytes: u64,
-    links: u64,
-    used: SystemTime,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::digest;
 
-/// All objects below `root`.
-fn objects(root: &Path) -> engine::Result<Vec<Object>> {
-    let mut found = Vec::new();
-    let folder = root.join("objects");
-    for path in crate::depot::files_below(&folder)? {
-        let path = folder.join(path);
-        let metadata = fs::metadata(&path).map_err(|error| engine::Error::io("read", &path, error))?;
-        let used = metadata.modified().unwrap_or(SystemTime::UNIX_EPOCH);
-        found.push(Object { bytes: metadata.len(), links: metadata.nlink(), used, path });
+    /// Catches a quota that work in progress does not count for, and work that fails because of what is kept.
+    #[test]
+    fn what_is_kept_makes_room_for_work_in_progress() {
+        let root = tempfile::tempdir().unwrap();
+        let cache = Cache::open(root.path(), 16_000).unwrap();
+        let keep = |name: &str, bytes: usize| {
+            let scratch = cache.scratch().unwrap();
+            let path = scratch.path().join(name);
+            let content = digest::of_bytes(&vec![name.as_bytes()[0]; bytes]);
+            fs::write(&path, vec![name.as_bytes()[0]; bytes]).unwrap();
+            cache.adopt(&path, &content)
+        };
+        keep("a", 7_000).unwrap();
+        keep("b", 7_000).unwrap();
+        assert_eq!(cache.bytes(), 14_000);
+        let work = cache.scratch().unwrap();
+        fs::write(work.path().join("work"), vec![0; 6_000]).unwrap();
+        keep("c", 1_000).unwrap();
+        assert!(cache.bytes() <= 10_000, "{}", cache.bytes());
+        // Work alone may take more than the quota: what is kept is only less useful then
+        fs::write(work.path().join("more"), vec![0; 60_000]).unwrap();
+        keep("d", 1_000).unwrap();
+        assert!(cache.bytes() <= 2_000, "{}", cache.bytes());
+        assert!(keep("e", 17_000).is_err());
     }
-    Ok(found)
-}
-
-fn make_folder(path: &Path) -> engine::Result<()> {
-    fs::create_dir_all(path).map_err(|error| engine::Error::io("create the folder", path, error))
-}
-
-fn remove(path: &Path) -> engine::Result<()> {
-    fs::remove_file(path).map_err(|error| engine::Error::io("remove", path, error))
 }

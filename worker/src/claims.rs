@@ -30,6 +30,8 @@ pub struct Claims {
     ask: Sender<Vec<Warm>>,
     come: Receiver<Claimed>,
     is_asked: bool,
+    /// A claim that has come before its time.
+    next: Option<Claimed>,
     warm: Vec<Warm>,
 }
 
@@ -46,18 +48,31 @@ impl Claims {
                 }
             }
         });
-        Self { ask, come, is_asked: false, warm: Vec::new() }
+        Self { ask, come, is_asked: false, next: None, warm: Vec::new() }
     }
 
-    /// Asks for the next claim, if that has not been done.
+    /// Asks for the next claim, if that has not been done and none has come.
     pub fn ask(&mut self) {
-        if !self.is_asked {
+        if !self.is_asked && self.next.is_none() {
             self.is_asked = self.ask.send(self.warm.clone()).is_ok();
         }
     }
 
     /// The claim that was asked for, if it comes within `wait`.
     pub fn wait(&mut self, wait: Duration) -> Option<Claimed> {
+        self.peek(wait);
+        self.next.take()
+    }
+
+    /// Looks at the claim that was asked for, if it comes within `wait`.
+    pub fn peek(&mut self, wait: Duration) -> Option<&Claimed> {
+        if self.next.is_none() {
+            self.next = self.receive(wait);
+        }
+        self.next.as_ref()
+    }
+
+    fn receive(&mut self, wait: Duration) -> Option<Claimed> {
         match self.come.recv_timeout(wait) {
             Ok(claimed) => {
                 self.is_asked = false;

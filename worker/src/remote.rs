@@ -37,10 +37,30 @@ impl LeaseDepot {
         Ok(urls)
     }
 
+    /// Uses a URL for `item`; once more with a new one where it does not hold any more, since transfers may have taken long.
+    fn with_url<T>(
+        &self,
+        item: &ObjectRequest,
+        url: &ObjectUrl,
+        mut transfer: impl FnMut(&ObjectUrl) -> Result<T>,
+    ) -> Result<T> {
+        let again = match transfer(url) {
+            Err(error) if error.status() == Some(403) && !url.url.starts_with('/') => {
+                transfer(&self.urls(vec![item.clone()])?[0])
+            }
+            result => return result,
+        };
+        again.map_err(|error| match error.status() {
+            Some(403) => Error::Unreachable(format!("storage: {error}")),
+            _ => error,
+        })
+    }
+
     /// Reads objects whose URLs are one answer's worth, several at once.
     fn read_some(&self, wanted: &[Wanted]) -> Vec<Result<FolderFile>> {
-        let items = wanted.iter().map(|wanted| ObjectRequest::Get { key: wanted.key.clone() }).collect();
-        let urls = match self.urls(items) {
+        let items: Vec<ObjectRequest> =
+            wanted.iter().map(|wanted| ObjectRequest::Get { key: wanted.key.clone() }).collect();
+        let urls = match self.urls(items.clone()) {
             Ok(urls) => urls,
             Err(error) => {
                 let again = |_: &Wanted| Err(error.repeated());
@@ -55,7 +75,9 @@ impl LeaseDepot {
                     loop {
                         let number = next.fetch_add(1, Ordering::Relaxed);
                         let Some(Wanted { path, bytes_max, .. }) = wanted.get(number) else { return };
-                        let result = self.client.download(&urls[number], path, *bytes_max);
+                        let result = self.with_url(&items[number], &urls[number], |url| {
+                            self.client.download(url, path, *bytes_max)
+                        });
                         came.lock().unwrap_or_else(PoisonError::into_inner)[number] = Some(result);
                     }
                 });
@@ -77,14 +99,16 @@ impl Depot for LeaseDepot {
     }
 
     fn read_range(&self, key: &str, offset: u64, out: &mut [u8]) -> Result<()> {
-        let urls = self.urls(vec![ObjectRequest::Get { key: key.into() }])?;
-        self.client.download_range(&urls[0], offset, out)
+        let item = ObjectRequest::Get { key: key.into() };
+        let url = self.urls(vec![item.clone()])?.remove(0);
+        self.with_url(&item, &url, |url| self.client.download_range(url, offset, out))
     }
 
     fn write(&self, key: &str, path: &Path, content: &FolderFile) -> Result<()> {
         let FolderFile { sha256, bytes } = content.clone();
-        let urls = self.urls(vec![ObjectRequest::Put { key: key.into(), sha256, bytes }])?;
-        self.client.upload(&urls[0], path)
+        let item = ObjectRequest::Put { key: key.into(), sha256, bytes };
+        let url = self.urls(vec![item.clone()])?.remove(0);
+        self.with_url(&item, &url, |url| self.client.upload(url, path))
     }
 
     fn parts(&self, after: Option<i64>) -> Result<PartPage> {

@@ -27,6 +27,11 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// How often a waiting worker looks whether it is to stop.
 const LOOK: Duration = Duration::from_millis(100);
 
+/// Batches of a claim that are left when the next one is asked for.
+const AHEAD: usize = 2;
+/// How long the last batch of a claim waits to know what comes after it: an answer that is on its way.
+const GLANCE: Duration = Duration::from_millis(20);
+
 /// What a worker is and may use.
 #[derive(Clone, Debug)]
 pub struct Options {
@@ -61,6 +66,8 @@ pub struct Summary {
     pub failed: u64,
     /// Batches that were given back.
     pub given_back: u64,
+    /// Bytes of objects that were fetched.
+    pub received_bytes: u64,
 }
 
 /// Works until `stop` is set, or the coordinator refuses the worker.
@@ -90,6 +97,7 @@ pub fn run(options: &Options, stop: &AtomicBool) -> Result<Summary> {
             None => break,
         }
     }
+    summary.received_bytes = options.client.received_bytes();
     Ok(summary)
 }
 
@@ -266,11 +274,19 @@ impl PartSink for ToSpool<'_> {
         let Claimed { claim, lease } = self.claimed;
         self.spool.push(lease, (claim.pass, &claim.task.job), batch, bytes, (elapsed, log))?;
         self.given += 1;
-        let is_wanted = !self.stop.load(Ordering::Relaxed) && lease.is_live();
-        // The next claim is on its way while the last batch of this one is traced
-        if self.given + 1 >= claim.batches.len() && is_wanted && !self.pulse.drain.load(Ordering::Relaxed) {
+        Ok(!self.stop.load(Ordering::Relaxed) && lease.is_live())
+    }
+
+    /// The next claim is on its way before the last batch of this one begins, so that its first bricks are known then.
+    fn begins(&mut self, left: usize) {
+        let is_wanted = !self.stop.load(Ordering::Relaxed) && self.claimed.lease.is_live();
+        if left <= AHEAD && is_wanted && !self.pulse.drain.load(Ordering::Relaxed) {
             self.claims.ask();
         }
-        Ok(is_wanted)
+    }
+
+    fn upcoming(&mut self, pass: i64) -> Option<ClaimedBatch> {
+        let next = self.claims.peek(GLANCE)?;
+        next.claim.batches.first().copied().filter(|_| next.claim.pass == pass)
     }
 }

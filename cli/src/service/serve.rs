@@ -36,9 +36,12 @@ pub struct Arguments {
     /// Where to listen
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8470")]
     listen: SocketAddr,
-    /// Where objects are: a folder, or `s3://BUCKET`, `gs://BUCKET`, `az://CONTAINER` [default: a folder beside the database]
+    /// Where objects are: a folder, or `s3://BUCKET/PREFIX`, `gs://…`, `az://…` [default: a folder beside the database]
     #[arg(long, value_name = "PLACE", env = "PANTARAY_STORAGE")]
     storage: Option<String>,
+    /// An option of S3 and its like, such as `aws_endpoint=http://minio:9000`; keys and secrets belong in the environment
+    #[arg(long, value_name = "NAME=VALUE", value_parser = option)]
+    storage_option: Vec<(String, String)>,
     /// Scenes may name files below DIR as `root:NAME/path`; may be repeated
     #[arg(long, value_name = "NAME=DIR", value_parser = crate::farm::pair)]
     root: Vec<(String, PathBuf)>,
@@ -69,6 +72,7 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         database: arguments.place.database(),
         connections: 32,
         storage: arguments.storage.clone().unwrap_or_else(folder),
+        storage_options: arguments.storage_option.iter().cloned().collect(),
         roots: arguments.root.iter().cloned().collect(),
         without_tokens: arguments.insecure_local,
         lease_ttl_ms: i64::from(arguments.lease) * 1_000,
@@ -91,6 +95,12 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         Ok(listen)
     })?;
     Answer::new(&json!({ "listened": served.to_string() }), "stopped")
+}
+
+/// `NAME=VALUE`, where the value may be empty.
+fn option(text: &str) -> Result<(String, String), String> {
+    let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE")?;
+    Ok((name.into(), value.into()))
 }
 
 /// A database without tokens gets one, for its administrator.

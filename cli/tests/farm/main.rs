@@ -2,7 +2,11 @@
 //! whatever happens to workers and coordinator meanwhile.
 #![cfg(unix)]
 
+mod faults;
 mod processes;
+mod proxy;
+mod s3;
+mod storage;
 
 use std::time::Duration;
 

@@ -1,8 +1,9 @@
 //! Coordinator, workers and commands as processes, ended with the test.
 
 use std::net::TcpListener;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -29,7 +30,12 @@ const TENT: &str = "v -1 0 -1\nv 1 0 -1\nv 0 2 0\nv -1 0 1\nv 1 0 1\nf 1 2 3\nf 
 /// A farm with a folder of its own.
 pub struct Farm {
     folder: TempDir,
-    port: u16,
+    /// The coordinator's port.
+    pub port: u16,
+    /// What the coordinator is started with besides.
+    serve: Vec<String>,
+    /// The environment of every process.
+    environment: Vec<(&'static str, String)>,
     coordinator: Option<Child>,
     workers: Vec<(String, Option<Child>)>,
 }
@@ -39,31 +45,48 @@ pub struct Farm {
 pub struct Worker(usize);
 
 impl Farm {
-    /// A coordinator, and a scene to submit.
+    /// A coordinator that asks for no tokens, and a scene to submit.
     pub fn start() -> Self {
+        Self::start_with(&["--insecure-local"], Vec::new())
+    }
+
+    /// A coordinator with more arguments, and an environment for it and everybody else.
+    pub fn start_with(serve: &[&str], environment: Vec<(&'static str, String)>) -> Self {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir_all(folder.path().join("scene/models")).unwrap();
         std::fs::write(folder.path().join("scene/scene.xml"), SCENE).unwrap();
         std::fs::write(folder.path().join("scene/models/tent.obj"), TENT).unwrap();
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let mut farm = Self { folder, port, coordinator: None, workers: Vec::new() };
+        let serve = serve.iter().map(|argument| argument.to_string()).collect();
+        let mut farm = Self { folder, port, serve, environment, coordinator: None, workers: Vec::new() };
         farm.start_coordinator();
         farm
     }
 
-    fn at(&self, name: &str) -> String {
+    /// A path in the farm's folder.
+    pub fn at(&self, name: &str) -> String {
         self.folder.path().join(name).to_str().unwrap().into()
     }
 
     fn pantaray(&self) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_pantaray"));
+        self.prepare(&mut command);
+        command
+    }
+
+    /// Gives a command its environment.
+    fn prepare(&self, command: &mut Command) {
+        let token = self.at("data/admin.token");
         command
             .env("PANTARAY_URL", format!("http://127.0.0.1:{}", self.port))
             .env_remove("PANTARAY_TOKEN_FILE");
+        if Path::new(&token).exists() {
+            command.env("PANTARAY_TOKEN_FILE", token);
+        }
+        command.envs(self.environment.iter().map(|(name, value)| (name, value)));
         for name in ["http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"] {
             command.env_remove(name);
         }
-        command
     }
 
     /// What a process says is kept in a file that a failed test shows.
@@ -75,8 +98,8 @@ impl Farm {
     /// Starts the coordinator on what it left, and waits until it listens.
     pub fn start_coordinator(&mut self) {
         let mut command = self.pantaray();
-        command.args(["serve", "--data", &self.at("data"), "--insecure-local", "--lease", "5", "--listen"]);
-        command.arg(format!("127.0.0.1:{}", self.port));
+        command.args(["serve", "--data", &self.at("data"), "--lease", "5", "--listen"]);
+        command.arg(format!("127.0.0.1:{}", self.port)).args(&self.serve);
         self.coordinator = Some(self.spawn(command, "coordinator"));
         let start = Instant::now();
         while std::net::TcpStream::connect(("127.0.0.1", self.port)).is_err() {
@@ -92,12 +115,35 @@ impl Farm {
 
     /// Starts a worker with a cache of its own.
     pub fn worker(&mut self, name: &str) -> Worker {
+        self.worker_at(name, &format!("http://127.0.0.1:{}", self.port), &[])
+    }
+
+    /// Starts a worker that knows the coordinator by this URL, with more arguments.
+    pub fn worker_at(&mut self, name: &str, url: &str, arguments: &[&str]) -> Worker {
         let mut command = self.pantaray();
-        command.args(["worker", "--json", "--name", name, "--cache", &self.at(name), "--device", "cpu"]);
-        command.args(["--threads", "1", "--memory", "256MiB", "--grace", "0"]);
+        self.add_worker(&mut command, name);
+        command.args(["--url", url]).args(arguments);
         let child = self.spawn(command, name);
         self.workers.push((name.into(), Some(child)));
         Worker(self.workers.len() - 1)
+    }
+
+    /// Starts a worker whose disk takes no file larger than `kilobytes`.
+    pub fn cramped_worker(&mut self, name: &str, kilobytes: u32) -> Worker {
+        let mut command = Command::new("bash");
+        self.prepare(&mut command);
+        // Without the trap the signal that comes with the error would end the process
+        let script = format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$0\" \"$@\"");
+        command.args(["-c", &script, env!("CARGO_BIN_EXE_pantaray")]);
+        self.add_worker(&mut command, name);
+        let child = self.spawn(command, name);
+        self.workers.push((name.into(), Some(child)));
+        Worker(self.workers.len() - 1)
+    }
+
+    fn add_worker(&self, command: &mut Command, name: &str) {
+        command.args(["worker", "--json", "--name", name, "--cache", &self.at(name), "--device", "cpu"]);
+        command.args(["--threads", "1", "--memory", "256MiB", "--grace", "0"]);
     }
 
     fn child(&mut self, worker: Worker) -> &mut Option<Child> {
@@ -126,6 +172,13 @@ impl Farm {
         let output = self.child(worker).take().unwrap().wait_with_output().unwrap();
         assert!(output.status.success(), "{}", self.logs());
         serde_json::from_slice(&output.stdout).unwrap()
+    }
+
+    /// Waits for the end of a worker that must fail; its exit code.
+    pub fn join_failed(&mut self, worker: Worker) -> Option<i32> {
+        let output = self.child(worker).take().unwrap().wait_with_output().unwrap();
+        assert!(!output.status.success(), "{}", self.logs());
+        output.status.code()
     }
 
     /// Runs a command that must succeed; its answer.
@@ -209,10 +262,26 @@ impl Farm {
         assert!(self.fetch(job).1 == baked, "the farm's bytes differ\n{}", self.logs());
     }
 
+    /// Compares what a job with seed 1 published with what one process bakes, once for all tests.
+    pub fn expect_same(&self, job: &str) {
+        static BAKED: OnceLock<Vec<u8>> = OnceLock::new();
+        let baked = BAKED.get_or_init(|| {
+            let (scene, folder) = (self.at("scene/scene.xml"), self.at("baked"));
+            let options = ["--seed", "1", "--device", "cpu", "--memory", "256MiB"];
+            self.command(&[&["bake", &scene, "-o", &folder], &options[..]].concat());
+            std::fs::read(PathBuf::from(folder).join("hill.mgs")).unwrap()
+        });
+        assert!(self.fetch(job).1 == *baked, "the farm's bytes differ\n{}", self.logs());
+    }
+
+    /// What a process has said so far.
+    pub fn log(&self, name: &str) -> String {
+        std::fs::read_to_string(self.at(&format!("{name}.log"))).unwrap_or_default()
+    }
+
     fn logs(&self) -> String {
         let names = self.workers.iter().map(|(name, _)| name.as_str()).chain(["coordinator"]);
-        let log = |name: &str| std::fs::read_to_string(self.at(&format!("{name}.log"))).unwrap_or_default();
-        names.map(|name| format!("--- {name}\n{}", log(name))).collect()
+        names.map(|name| format!("--- {name}\n{}", self.log(name))).collect()
     }
 }
 

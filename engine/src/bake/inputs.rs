@@ -162,6 +162,16 @@ impl Inputs {
         }
     }
 
+    /// The files that a geometry's stream is read from.
+    pub fn files<'a>(&'a self, scene: &'a Scene, geometry: usize) -> impl Iterator<Item = &'a Path> {
+        let parts = self.files[geometry].iter().flatten().flat_map(|parts| &parts.parts);
+        let instances = scene.geometries[geometry].instances.iter().filter_map(|instances| match instances {
+            Instances::File(path) => Some(&**path),
+            Instances::Matrix(_) => None,
+        });
+        parts.map(|part| &*part.file).chain(instances)
+    }
+
     /// The stream of a geometry in the scene's units and axes, instances expanded.
     ///
     /// # Errors

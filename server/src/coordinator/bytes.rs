@@ -72,25 +72,25 @@ impl Coordinator {
         task: &Task,
         item: &ObjectRequest,
     ) -> Result<ObjectUrl> {
-        let (key, query) = match item {
+        let ttl = Duration::from_millis(URL_TTL_MS);
+        let (key, query, signed) = match item {
             ObjectRequest::Get { key } => {
                 self.may_read(held, task, key).await?;
-                (key, String::new())
+                (key, String::new(), self.storage.get_url(key, ttl).await?)
             }
             ObjectRequest::Put { key, sha256, bytes } => {
                 may_write(held, task, key)?;
-                if !keys::is_sha256(sha256) || *bytes > self.settings.asset_bytes_max {
+                let bytes_max = self.settings.asset_bytes_max;
+                if !keys::is_sha256(sha256) || *bytes > bytes_max {
                     return Err(Error::invalid(format!("`{key}` cannot have this hash and `{bytes}` bytes")));
                 }
-                (key, format!("&sha256={sha256}&bytes={bytes}"))
+                let expected = Expected { sha256, bytes: Some(*bytes), bytes_max };
+                let query = format!("&sha256={sha256}&bytes={bytes}");
+                (key, query, self.storage.put_url(key, expected, ttl).await?)
             }
         };
-        let ttl = Duration::from_millis(URL_TTL_MS);
-        let url = match self.storage.url(!query.is_empty(), key, ttl).await? {
-            Some(url) => url,
-            None => format!("/v1/leases/{lease}/objects?session={session}&key={}{query}", escaped(key)),
-        };
-        Ok(ObjectUrl { url, headers: Default::default() })
+        let own = || format!("/v1/leases/{lease}/objects?session={session}&key={}{query}", escaped(key));
+        Ok(signed.unwrap_or_else(|| ObjectUrl { url: own(), headers: Default::default() }))
     }
 
     /// An object of a lease, or a range of it.

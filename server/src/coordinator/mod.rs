@@ -71,7 +71,8 @@ impl Coordinator {
     /// # Errors
     /// When database or storage cannot be opened.
     pub async fn open(settings: Settings) -> Result<Arc<Self>> {
-        let storage = Storage::open(&settings.storage)?;
+        let storage = Storage::open(&settings.storage, &settings.storage_options)?;
+        storage.probe().await?;
         let store = Store::open(&settings.database, settings.connections).await?;
         store.migrate().await?;
         let clock = Clock::default();

@@ -9,6 +9,8 @@ mod tests;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use protocol::Problem;
@@ -16,6 +18,7 @@ use protocol::storage::{FolderFile, ObjectUrl};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use ureq::http::{Request, Response};
+use ureq::tls::{RootCerts, TlsConfig};
 use ureq::{Agent, AsSendBody, Body};
 
 use crate::digest::Hasher;
@@ -41,6 +44,8 @@ pub struct Client {
     base: String,
     token: Option<String>,
     patience: Duration,
+    /// Bytes of objects that came, over all clones.
+    received: Arc<AtomicU64>,
 }
 
 /// A reply that is not the end.
@@ -55,19 +60,24 @@ impl Client {
     /// # Errors
     /// [`engine::ErrorKind::Invalid`] for what is no URL of a coordinator.
     pub fn new(url: &str, token: Option<&str>, patience: Duration) -> engine::Result<Self> {
-        let known = if cfg!(feature = "tls") { &["http://", "https://"][..] } else { &["http://"] };
-        if !known.iter().any(|scheme| url.starts_with(scheme)) {
+        if !["http://", "https://"].iter().any(|scheme| url.starts_with(scheme)) {
             let message = format!("`{url}` is not the URL of a coordinator");
-            return Err(engine::Error::invalid(message).hint(format!("begin with {}", known.join(" or "))));
+            return Err(engine::Error::invalid(message).hint("begin with `http://` or `https://`"));
         }
+        // Whom the machine trusts: a studio's own authority is among them
+        let tls = TlsConfig::builder()
+            .root_certs(RootCerts::PlatformVerifier)
+            .unversioned_rustls_crypto_provider(Arc::new(rustls::crypto::ring::default_provider()))
+            .build();
         let config = Agent::config_builder()
+            .tls_config(tls)
             .http_status_as_error(false)
             .timeout_connect(Some(CONNECT))
             .max_redirects(0)
             .user_agent(concat!("pantaray/", env!("CARGO_PKG_VERSION")))
             .build();
         let (base, token) = (url.trim_end_matches('/').to_owned(), token.map(str::to_owned));
-        Ok(Self { agent: config.into(), base, token, patience })
+        Ok(Self { agent: config.into(), base, token, patience, received: Arc::default() })
     }
 
     /// The same coordinator with another patience.
@@ -78,6 +88,11 @@ impl Client {
     /// The same coordinator for somebody else.
     pub fn with_token(&self, token: &str) -> Self {
         Self { token: Some(token.into()), ..self.clone() }
+    }
+
+    /// Bytes of objects that came so far.
+    pub fn received_bytes(&self) -> u64 {
+        self.received.load(Ordering::Relaxed)
     }
 
     /// The coordinator's URL.
@@ -162,9 +177,11 @@ impl Client {
         let timeout = transfer_time(bytes_max.min(1 << 32));
         self.repeat(&url.url, |client| {
             let reply = client.send(client.request("GET", url), (), timeout)?;
-            let mut body = client.judge(reply)?.into_body();
+            let reply = client.judge(reply).map_err(|failure| blame_storage(url, failure))?;
+            let mut body = reply.into_body();
             let announced = body.content_length();
             let content = store(&mut body.with_config().limit(bytes_max).reader(), path)?;
+            client.received.fetch_add(content.bytes, Ordering::Relaxed);
             match announced {
                 Some(bytes) if bytes != content.bytes => Err(Failure::Trouble(Trouble {
                     message: format!("the transfer ended after {} of {bytes} bytes", content.bytes),
@@ -184,7 +201,8 @@ impl Client {
         let range = format!("bytes={offset}-{}", offset + out.len() as u64 - 1);
         self.repeat(&url.url, |client| {
             let request = client.request("GET", url).header("range", &range);
-            let mut reply = client.judge(client.send(request, (), timeout)?)?;
+            let reply = client.judge(client.send(request, (), timeout)?);
+            let mut reply = reply.map_err(|failure| blame_storage(url, failure))?;
             if reply.status().as_u16() != 206 {
                 return Err(Failure::End(Error::Unreachable("the storage does not know ranges".into())));
             }
@@ -194,7 +212,9 @@ impl Client {
                     retry_after: None,
                 })
             };
-            reply.body_mut().as_reader().read_exact(out).map_err(broke_off)
+            reply.body_mut().as_reader().read_exact(out).map_err(broke_off)?;
+            client.received.fetch_add(out.len() as u64, Ordering::Relaxed);
+            Ok(())
         })
     }
 
@@ -228,7 +248,8 @@ impl Client {
         self.repeat(&url.url, |client| {
             let file = open().map_err(Error::from)?;
             let request = client.request("PUT", url).header("content-type", "application/octet-stream");
-            client.judge(client.send(request, &file, timeout)?).map(drop)
+            let reply = client.send(request, &file, timeout)?;
+            client.judge(reply).map_err(|failure| blame_storage(url, failure)).map(drop)
         })
     }
 
@@ -318,6 +339,20 @@ enum Failure {
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
         Self::End(error)
+    }
+}
+
+/// A signed URL that has run out is told from an object that is not there, and both from storage that will not do what it
+/// must, which is no fault of the worker.
+fn blame_storage(url: &ObjectUrl, failure: Failure) -> Failure {
+    match failure {
+        Failure::End(Error::Refused(problem)) if !url.url.starts_with('/') => {
+            Failure::End(match problem.status {
+                403 | 404 => Error::Refused(problem),
+                _ => Error::Unreachable(format!("storage: {} ({})", problem.detail, problem.status)),
+            })
+        }
+        failure => failure,
     }
 }
 

@@ -9,6 +9,7 @@ use protocol::storage::FolderFile;
 use protocol::work::{ClaimedBatch, PartEntry, PassResult};
 use protocol::{keys, limits};
 
+use super::inputs::Reads;
 use super::{Executor, Finished, Work, need};
 use crate::depot::{Depot, Wanted};
 use crate::{Error, Result, digest};
@@ -20,7 +21,7 @@ impl Executor {
     /// Merges the parts of a bake pass into the decorated stream, and puts it.
     pub(super) fn merge(&mut self, work: Work<'_>, folder: &str) -> Result<Finished> {
         let task = &work.claim.task;
-        let prepared = self.prepare(work)?;
+        let prepared = self.prepare(work, Reads::Carrier)?;
         let plan_folder = self.fetch_folder(&**work.depot, need(&task.plan, "plan")?)?;
         let plan = BatchPlan::open(plan_folder.path())?;
         let set = prepared.set(task)?;

@@ -20,14 +20,14 @@ use protocol::storage::{FolderFile, FolderIndex};
 use protocol::work::{Claim, ClaimedBatch, PassResult, SetMap, Task};
 use protocol::{PassKind, keys};
 
-use self::inputs::Prepared;
+use self::inputs::{Prepared, Reads};
 use self::trace::Bench;
 use crate::cache::{Cache, Entry, Folder};
 use crate::depot::{Depot, read_index, write_folder};
 use crate::{Error, Result, digest};
 
-/// Folders of one claim that may be found damaged one after the other: scene and inputs, plan, brick map.
-const HEALINGS_MAX: usize = 3;
+/// Folders of one claim that may be found damaged one after the other: record, streams, plan, brick map.
+const HEALINGS_MAX: usize = 4;
 
 /// Takes the step that a claim asks for; keeps what the next claim of the same pass will need.
 pub struct Executor {
@@ -71,6 +71,15 @@ pub trait PartSink {
     /// # Errors
     /// When it cannot be kept.
     fn part(&mut self, batch: ClaimedBatch, bytes: &[u8], elapsed: Duration, log: &str) -> Result<bool>;
+
+    /// A batch begins; with it, `left` are left of the claim.
+    fn begins(&mut self, _left: usize) {}
+
+    /// The first batch of the next claim where that is known to be of `pass` too: its bricks are loaded while the last
+    /// batch of this claim is traced.
+    fn upcoming(&mut self, _pass: i64) -> Option<ClaimedBatch> {
+        None
+    }
 }
 
 impl Executor {
@@ -146,18 +155,12 @@ impl Executor {
     /// Builds a brick map and puts it under its content key.
     fn build(&mut self, work: Work<'_>) -> Result<Finished> {
         let key = need(&work.claim.task.map, "brick map")?;
-        let prepared = self.prepare(work)?;
+        let prepared = self.prepare(work, Reads::Occluders)?;
+        let seen = prepared.occluders(key)?;
+        let Prepared { scene, inputs, options, .. } = &prepared;
         let scratch = self.cache.scratch()?;
-        let options = &prepared.options;
-        let sets = SetBake::all(&prepared.scene, &prepared.inputs, options)?;
-        let seen = sets.iter().find(|set| map_key(&prepared.inputs, &set.occluders, options) == *key);
-        let seen = seen.ok_or_else(|| {
-            engine::Error::invalid(format!("no bake set of the scene needs the brick map `{key}`"))
-                .hint("coordinator and worker must be of the same version")
-        })?;
         let (target, build) = (scratch.path().join(key), scratch.path().join("build"));
-        let Prepared { scene, inputs, .. } = &prepared;
-        build_if_missing(scene, inputs, &seen.occluders, options, &build, &target, work.control)?;
+        build_if_missing(scene, inputs, &seen, options, &build, &target, work.control)?;
         let map = BrickMap::open(&target)?;
         let manifest = map.manifest();
         let result = PassResult::Build {
@@ -174,7 +177,7 @@ impl Executor {
 
     /// Splits the points of a bake set into batches.
     fn plan(&mut self, work: Work<'_>, folder: &str) -> Result<Finished> {
-        let prepared = self.prepare(work)?;
+        let prepared = self.prepare(work, Reads::Carrier)?;
         let set = prepared.set(&work.claim.task)?;
         let (scratch, target) = (self.cache.scratch()?, self.cache.scratch()?);
         let plan = set.plan(target.path(), work.control)?;

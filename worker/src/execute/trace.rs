@@ -10,6 +10,7 @@ use engine::output::Part;
 use protocol::work::ClaimedBatch;
 
 use super::bricks::RemoteBricks;
+use super::inputs::Reads;
 use super::{Executor, PartSink, Work, need};
 use crate::Result;
 use crate::cache::{Entry, Folder};
@@ -42,11 +43,14 @@ impl Executor {
         let (mut part, mut bytes) = (Part::default(), Vec::new());
         let claimed = &work.claim.batches;
         for (number, &batch) in claimed.iter().enumerate() {
+            sink.begins(claimed.len() - number);
             let start = Instant::now();
             bytes.clear();
             let mut totals = BakeWork::default();
             if let Some(planned) = bench.planned(batch) {
-                let next = claimed.get(number + 1).and_then(|&next| bench.planned(next));
+                let next = claimed.get(number + 1).copied();
+                let next = next.or_else(|| sink.upcoming(work.claim.pass));
+                let next = next.and_then(|next| bench.planned(next));
                 bench.tracer.expect(next)?;
                 bench.tracer.trace(planned, &mut part, &mut totals, work.control.cancel)?;
                 part.encode(bench.tracer.format(), &mut bytes)?;
@@ -65,7 +69,7 @@ impl Executor {
     /// Gets everything that the batches of a pass need.
     fn set_up(&mut self, work: Work<'_>) -> Result<Bench> {
         let task = &work.claim.task;
-        let prepared = self.prepare(work)?;
+        let prepared = self.prepare(work, Reads::Nothing)?;
         let plan_folder = self.fetch_folder(&**work.depot, need(&task.plan, "plan")?)?;
         let plan = Arc::new(BatchPlan::open(plan_folder.path())?);
         let (map, map_folder, bricks) = self.map(work.depot, need(&task.map, "brick map")?)?;
