@@ -168,11 +168,7 @@ fn damaged_maps_are_refused() {
     let manifest = target.join("manifest.json");
     let text = std::fs::read_to_string(&manifest).unwrap();
     let lies = [
-<<<<<<< HEAD
-        ("\"version\": 3", "\"version\": 3", ErrorKind::Unsupported),
-=======
         ("\"version\": 3", "\"version\": 4", ErrorKind::Unsupported),
->>>>>>> parts
         ("\"bricks\": ", "\"bricks\": 4", ErrorKind::Corrupt),
         ("\"lattice_exponent\": ", "\"lattice_exponent\": 99", ErrorKind::Corrupt),
         ("{", "[", ErrorKind::Corrupt),

@@ -12,6 +12,8 @@ mod cut;
 mod diced;
 mod emit;
 mod gltf;
+mod large;
+mod leaves;
 mod lines;
 mod mesh;
 mod obj;
@@ -30,13 +32,30 @@ mod hostile;
 use std::path::Path;
 
 pub use self::assembly::Copies;
-pub use self::parts::{Part, Parts, SavedParts, import_parts};
+pub use self::parts::{Part, Parts, SavedParts, Step, import_parts};
 pub use self::usd::PRIMS_KEY;
 use crate::stream::{Microgrid, Schema, schema::UpAxis};
 use crate::{Error, Result};
 
+/// What a file takes and becomes, as far as that is known before it is read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Expected {
+    /// Bytes that the import will hold at once, at most.
+    pub memory_bytes: u64,
+    /// Micropolygons that leaves become, cut along their texture.
+    pub leaves: u64,
+}
+
 /// Receives an imported stream: the schema once, then every grid in order.
 pub trait GridSink {
+    /// Learns what is to come, before anything else.
+    ///
+    /// # Errors
+    /// When the sink does not want it; the import stops with this error.
+    fn expect(&mut self, _: &Expected) -> Result<()> {
+        Ok(())
+    }
+
     /// Learns the attributes and the space of the grids that follow, and what the file says about itself.
     ///
     /// # Errors
@@ -71,8 +90,22 @@ pub struct ImportOptions {
     pub frame: Option<f64>,
     /// How fine to dice; none keeps faces as they are.
     pub dice: Option<crate::dice::Rate>,
+    /// Texels along the edges of leaves that are cut along their texture; none means two where faces are diced, and
+    /// that leaves stay whole where they are not.
+    pub texels: Option<f64>,
+    /// Micropolygons that the leaves of a file may become.
+    pub leaves_max: u64,
+    /// Where meshes larger than memory wait on disk; none is the system's folder for temporary files.
+    pub scratch: Option<std::path::PathBuf>,
     /// Seconds that may pass until a USD file yields its next prim: a broken one may take for ever.
     pub patience_seconds: u64,
+}
+
+impl ImportOptions {
+    /// Where meshes larger than memory wait on disk.
+    fn scratch_folder(&self) -> std::path::PathBuf {
+        self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
 }
 
 impl Default for ImportOptions {
@@ -83,6 +116,9 @@ impl Default for ImportOptions {
             memory_bytes: 1 << 30,
             frame: None,
             dice: None,
+            texels: None,
+            leaves_max: 1 << 28,
+            scratch: None,
             patience_seconds: 300,
         }
     }

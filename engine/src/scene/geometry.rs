@@ -9,8 +9,8 @@ use super::names::Names;
 use super::output::asked_for;
 use super::parse::limited;
 use super::{
-    BakeAttribute, BakeSet, Dice, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result, Shader,
-    StreamSource,
+    BakeAttribute, BakeSet, Dice, Edge, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result,
+    Shader, StreamSource,
 };
 use crate::stream::schema::ATTRIBUTES_MAX;
 
@@ -147,10 +147,15 @@ impl<'a, 'd> Geometries<'a, 'd> {
             let placed = value.error(error.kind(), error.message());
             error.hint_text().into_iter().fold(placed, |placed, hint| placed.hint(hint))
         })?;
-        if let Dice::Camera { name, .. } = &dice
+        if let Some(Edge::Camera { name, .. }) = &dice.edge
             && !self.cameras.all().any(|known| known == name)
         {
-            return Err(value.unknown_word("camera:".len(), name, "camera", self.cameras.all()));
+            return Err(value.unknown_word(
+                value.text().find(name.as_str()).unwrap_or(0),
+                name,
+                "camera",
+                self.cameras.all(),
+            ));
         }
         Ok(dice)
     }
