@@ -63,13 +63,15 @@ impl Console {
         if text.is_empty() { Ok(()) } else { print(text) }
     }
 
+    /// Prints an answer.
+    pub fn show(&self, answer: &Answer) -> Result<()> {
+        self.print_more(if self.json { &answer.json } else { &answer.text })
+    }
+
     /// Prints the answer or the error and says how the process ends.
     pub fn finish(&self, result: Result<Answer>) -> ExitCode {
         self.progress.end(result.is_ok());
-        let printed = result.and_then(|answer| {
-            let text = if self.json { &answer.json } else { &answer.text };
-            self.print_more(text)
-        });
+        let printed = result.and_then(|answer| self.show(&answer));
         match printed {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {

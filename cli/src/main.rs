@@ -74,6 +74,7 @@ enum Command {
     Logs(farm::logs::Arguments),
     Fetch(farm::fetch::Arguments),
     Serve(service::serve::Arguments),
+    Sim(service::sim::Arguments),
     /// Make, list and revoke tokens
     #[command(subcommand)]
     Token(service::token::Command),
@@ -110,6 +111,7 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
         Command::Logs(arguments) => farm::logs::run(arguments, console),
         Command::Fetch(arguments) => farm::fetch::run(arguments, console),
         Command::Serve(arguments) => service::serve::run(arguments),
+        Command::Sim(arguments) => service::sim::run(&arguments, console),
         Command::Token(command) => service::token::run(command),
     }
 }

@@ -112,11 +112,13 @@ pub struct Estimate {
     pub sets: Vec<SetEstimate>,
     /// Bytes of the files that it reads.
     pub input_bytes: u64,
-    /// Points of all bake sets, where the inputs say before they are read.
+    /// About how many points of all bake sets, where the inputs say before they are read.
     pub points: Option<u64>,
     /// Batches of all bake sets, likewise.
     pub batches: Option<u64>,
-    /// Seconds of one worker, from the farm's recent batches, where there were any.
+    /// Bytes that are added to the streams, before compression, likewise.
+    pub result_bytes: Option<u64>,
+    /// Seconds of one worker for the batches, at the pace of the farm's latest bakes, where there were any.
     pub worker_seconds: Option<f64>,
 }
 
@@ -125,10 +127,12 @@ pub struct Estimate {
 pub struct SetEstimate {
     /// Its name.
     pub name: String,
-    /// Points, where known.
+    /// About how many points, where known.
     pub points: Option<u64>,
     /// Batches, where known.
     pub batches: Option<u64>,
+    /// Bytes that are added to the stream, before compression, where known.
+    pub result_bytes: Option<u64>,
 }
 
 /// Counts of batches by state.
@@ -231,6 +235,8 @@ pub struct JobDetail {
     pub waiting: WaitReason,
     /// Milliseconds that are left at the present pace, once there is one.
     pub left_ms: Option<i64>,
+    /// Milliseconds of one worker for the batches that are left, at the job's pace or else that of the farm's latest bakes.
+    pub left_worker_ms: Option<i64>,
 }
 
 /// A pass.
@@ -250,6 +256,8 @@ pub struct PassDetail {
     pub reused: bool,
     /// Mean milliseconds of a batch.
     pub batch_ms: i64,
+    /// What it found out, such as how many batches and points there are, and of how many bytes its result is.
+    pub result: Option<PassResult>,
     /// When it was made.
     pub created_at: i64,
     /// When it ended.

@@ -1,4 +1,4 @@
-//! Points at which a test kills the process. Without the feature `faults` they are nothing.
+//! Points at which a test kills the process, and a system clock that is wrong. Without the feature `faults` they are nothing.
 
 /// Kills the process here if `PANTARAY_FAULT` is `NAME:WHEN:COUNT` and this is the point's `COUNT`th passing.
 #[cfg(feature = "faults")]
@@ -25,3 +25,16 @@ pub fn point(name: &str, when: &str) {
 #[cfg(not(feature = "faults"))]
 #[inline]
 pub fn point(_name: &str, _when: &str) {}
+
+/// Milliseconds by which the system's clock is wrong, as `PANTARAY_CLOCK_OFF_MS` says.
+#[cfg(feature = "faults")]
+pub fn clock_off_ms() -> i64 {
+    std::env::var("PANTARAY_CLOCK_OFF_MS").ok().and_then(|text| text.parse().ok()).unwrap_or(0)
+}
+
+/// None.
+#[cfg(not(feature = "faults"))]
+#[inline]
+pub fn clock_off_ms() -> i64 {
+    0
+}

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use protocol::admin::{
-    EnrolRequest, MissingReply, MissingRequest, Secret, TokenDetail, TokenRequest, WorkerDetail,
+    EnrolRequest, MissingReply, MissingRequest, Project, Secret, TokenDetail, TokenRequest, WorkerDetail,
 };
 use protocol::job::{
     BatchSelection, Changed, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary, Manifest,
@@ -139,6 +139,11 @@ impl Client {
     /// All tokens, latest first.
     pub fn tokens(&self) -> Result<Vec<TokenDetail>> {
         self.get("/v1/tokens")
+    }
+
+    /// Makes a project, or changes its share.
+    pub fn put_project(&self, project: &Project) -> Result<Value> {
+        self.put(&format!("/v1/projects/{}", project.name), project)
     }
 
     /// Revokes a token.

@@ -14,7 +14,7 @@ pub mod digest;
 mod error;
 pub mod execute;
 mod heartbeat;
-mod remote;
+pub mod remote;
 pub mod run;
 pub mod settings;
 mod spool;

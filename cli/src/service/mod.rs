@@ -2,6 +2,7 @@
 
 mod embedded;
 pub mod serve;
+pub mod sim;
 pub mod token;
 
 use std::path::{Path, PathBuf};

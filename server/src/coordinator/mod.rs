@@ -4,6 +4,7 @@
 //! wasteful, and none needs to be the leader when another dies.
 
 pub mod bytes;
+mod estimate;
 pub mod pace;
 mod publish;
 pub mod submit;

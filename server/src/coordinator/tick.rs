@@ -88,7 +88,7 @@ impl Coordinator {
         if times.seen.elapsed() >= SEEN {
             times.seen = Instant::now();
             let seen: Vec<String> = lock(&self.seen).drain().collect();
-            self.store.seen(&seen, self.now()).await?;
+            self.renew_sessions(self.store.seen(&seen, self.now()).await?);
         }
         Ok(more)
     }

@@ -1,6 +1,6 @@
 //! Whether a request for a job can be carried out, and what it would ask of the farm: before anything is stored.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use engine::bake::set::require_sets;
@@ -10,7 +10,7 @@ use engine::scene::{Roots, Scene, StreamSource, load_confined};
 use protocol::job::{BakeSettings, Estimate, JobRequest, SetEstimate};
 use protocol::{keys, limits};
 
-use super::Coordinator;
+use super::{Coordinator, estimate};
 use crate::error::Kind;
 use crate::{Error, Result};
 
@@ -43,16 +43,19 @@ impl Coordinator {
         let hashes: BTreeSet<&String> = request.files.values().collect();
         let hashes: Vec<String> = hashes.into_iter().cloned().collect();
         let asset_bytes = self.store.asset_bytes(&request.project, &hashes).await?;
-        let sets = sets.into_iter().map(|name| SetEstimate { name, points: None, batches: None }).collect();
         let input_bytes = root_bytes + asset_bytes.unsigned_abs();
-        Ok(Estimate { sets, input_bytes, points: None, batches: None, worker_seconds: None })
+        Ok(estimate::total(sets, input_bytes, self.store.recent_batch_ms().await?))
     }
 
-    /// Reads the scene once for each frame; the last one's bake sets, and the bytes of its files below asset roots.
-    async fn read_scene(&self, request: &JobRequest, frames: Vec<Option<i64>>) -> Result<(Vec<String>, u64)> {
-        let (scene, files) = (request.scene.clone(), request.files.clone());
-        let roots = self.settings.roots.clone();
-        let read = tokio::task::spawn_blocking(move || read_frames(&scene, &files, &frames, &roots));
+    /// Reads the scene once for each frame; what the last one's bake sets ask for, and the bytes of its files below asset
+    /// roots.
+    async fn read_scene(
+        &self,
+        request: &JobRequest,
+        frames: Vec<Option<i64>>,
+    ) -> Result<(Vec<SetEstimate>, u64)> {
+        let (request, roots) = (request.clone(), self.settings.roots.clone());
+        let read = tokio::task::spawn_blocking(move || read_frames(&request, &frames, &roots));
         read.await.map_err(|error| {
             tracing::error!(%error, "a scene could not be read");
             Error::new(Kind::Internal, "the scene could not be read")
@@ -128,13 +131,12 @@ fn frames(request: &JobRequest) -> Result<Vec<Option<i64>>> {
 
 /// Reads a scene in an empty folder with the names of its files: what they hold is for workers to read.
 fn read_frames(
-    scene: &str,
-    files: &BTreeMap<String, String>,
+    request: &JobRequest,
     frames: &[Option<i64>],
     roots: &Roots,
-) -> Result<(Vec<String>, u64)> {
+) -> Result<(Vec<SetEstimate>, u64)> {
     let folder = tempfile::tempdir()?;
-    for path in files.keys() {
+    for path in request.files.keys() {
         let path = folder.path().join(path);
         let place = |()| std::fs::File::create_new(&path).map(drop);
         // Two files of which one would lie below the other
@@ -144,13 +146,13 @@ fn read_frames(
         })?;
     }
     let path = folder.path().join("scene.xml");
-    std::fs::write(&path, scene)?;
+    std::fs::write(&path, &request.scene)?;
     let mut found = (Vec::new(), 0);
     for &frame in frames {
         let read = load_confined(&path, frame, roots).and_then(|scene| require_sets(&scene).map(|()| scene));
         let scene = read.map_err(|error| refused(&error, folder.path()))?;
-        let sets = scene.geometries.iter().flat_map(|geometry| &geometry.bake_sets);
-        found = (sets.map(|set| set.name.clone()).collect(), root_bytes(&scene, folder.path()));
+        let sets = estimate::sets(&scene, &request.settings, folder.path());
+        found = (sets, root_bytes(&scene, folder.path()));
     }
     Ok(found)
 }

@@ -19,8 +19,9 @@ use crate::error::Kind;
 use crate::scheduler::choose::{Asker, Candidate, Locality, choose};
 use crate::{Error, Result, random};
 
-/// Milliseconds for which a session is not asked of the database again.
-const SESSION_MS: i64 = 5_000;
+/// Milliseconds for which a session is not asked of the database again. Those that go on are renewed together, sooner than
+/// that; and a claim is the database's to refuse.
+const SESSION_MS: i64 = 60_000;
 /// Sessions and tasks that are remembered at most.
 const REMEMBERED_MAX: usize = 65_536;
 /// Milliseconds for which a segment that gave nothing is left alone.
@@ -52,6 +53,7 @@ impl Coordinator {
         }
         let session = random::id(self.now());
         self.store.register(request, &labels, token, &session, self.now()).await?;
+        self.forget_sessions(&request.name);
         let around = self.around(&request.name);
         for completion in self.store.end_leases_of(&request.name, &session, &around).await? {
             self.settled(&completion);
@@ -87,6 +89,22 @@ impl Coordinator {
             }
         });
         Ok(session)
+    }
+
+    /// Forgets what was known of a worker's processes.
+    pub fn forget_sessions(&self, worker: &str) {
+        lock(&self.sessions).retain(|_, (session, _)| session.worker != worker);
+    }
+
+    /// Remembers processes that the database has just named.
+    pub(super) fn renew_sessions(&self, named: Vec<(String, Session)>) {
+        let now = self.now();
+        let mut sessions = lock(&self.sessions);
+        for (id, session) in named {
+            if let Some(known) = sessions.get_mut(&id) {
+                *known = (session, now);
+            }
+        }
     }
 
     /// Claims work, waiting for it as long as the request allows.
@@ -147,7 +165,8 @@ impl Coordinator {
             };
             let Candidate { pass, segment, locality, .. } = candidate;
             let count = granted.batches.len() as i64;
-            self.write_farm(|farm| farm.claimed(pass, segment, &session.worker, now + 2 * ttl, count));
+            let owner = (!from_tail).then_some((session.worker.as_str(), now + 2 * ttl));
+            self.write_farm(|farm| farm.claimed(pass, segment, owner, count));
             metrics::counter!("pantaray_claims_locality_total", "kind" => locality.word()).increment(1);
             metrics::histogram!("pantaray_claim_seconds").record(start.elapsed().as_secs_f64());
             let task = self.task(pass).await?;
@@ -244,7 +263,8 @@ impl Coordinator {
     pub(super) fn settled(&self, completion: &Completion) {
         let Completion { pass, segment, ended, ready, .. } = *completion;
         if ended > 0 {
-            self.write_farm(|farm| farm.returned(pass, segment, ended, ready));
+            let is_over = !completion.lease_live;
+            self.write_farm(|farm| farm.returned(pass, segment, ended, ready, is_over));
             self.wake_workers(ready);
         }
         if completion.diverged {
@@ -253,6 +273,9 @@ impl Coordinator {
         }
         if completion.advances || completion.storm.is_some() {
             self.changed([completion.job.clone()]);
+        } else if completion.blames {
+            // Whether the worker gets more of this job, or of any, is in the database
+            self.changed([]);
         }
     }
 

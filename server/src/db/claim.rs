@@ -47,13 +47,15 @@ impl Store {
         let Candidate { pass, segment, count, .. } = *candidate;
         let mut tx = self.begin().await?;
 
-        // Lock the segment, or leave it to whoever has it
+        // Lock the segment, or leave it to whoever has it; a process whose name another has taken gets nothing
         let sql = format!(
             "SELECT p.job_id, j.started_at FROM segment s JOIN pass p ON p.id = s.pass_id JOIN job j ON j.id = p.job_id
-            WHERE s.pass_id = $1 AND s.seg = $2 AND s.n_ready > 0 AND p.state = $3 AND j.paused = 0{}",
+            WHERE s.pass_id = $1 AND s.seg = $2 AND s.n_ready > 0 AND p.state = $3 AND j.paused = 0
+                AND NOT EXISTS (SELECT 1 FROM worker w WHERE w.name = $4 AND w.session <> $5){}",
             self.dialect().lock_s_skip
         );
-        let rows = tx.query(sql.into(), values![pass, segment, PassState::Open.code()]).await?;
+        let values = values![pass, segment, PassState::Open.code(), claimer.worker, claimer.session];
+        let rows = tx.query(sql.into(), values).await?;
         let Some(row) = rows.first() else {
             tx.rollback().await?;
             return Ok(None);

@@ -49,6 +49,8 @@ pub struct Completion {
     pub diverged: bool,
     /// What the pass does.
     pub kind: Option<PassKind>,
+    /// Whether the worker is to blame for a failure.
+    pub blames: bool,
     /// Why the job was paused, if it was.
     pub storm: Option<String>,
 }
@@ -211,6 +213,7 @@ impl Store {
             let Some(ruling) = self.fail(tx, &failure, &reporter.around).await? else { continue };
             completion.verdicts[number] = Verdict::Accepted;
             tally.count(ruling.fails);
+            completion.blames |= ruling.blames_worker;
             if context.kind == PassKind::Merge && !bad_parts.is_empty() && !ruling.fails {
                 self.take_parts_back(tx, context, bad_parts).await?;
                 completion.advances = true;

@@ -21,9 +21,11 @@ impl Store {
         self.load_jobs(&mut farm).await?;
         if !farm.passes.is_empty() {
             self.load_segments(&mut farm).await?;
+            self.load_leases(&mut farm).await?;
         }
         for row in self.query("SELECT name, share, running_max FROM project", vec![]).await? {
-            let project = Project { share: row.int(1)?, running_max: row.int_or_null(2)?, running: 0 };
+            let project =
+                Project { share: row.int(1)?, running_max: row.int_or_null(2)?, running: 0, leases: 0 };
             farm.projects.insert(row.text(0)?, project);
         }
         let sql = "SELECT name, labels, memory_bytes, locked + draining, sick_until, last_seen FROM worker";
@@ -38,11 +40,12 @@ impl Store {
         }
         let sql = "SELECT b.worker, b.job_id FROM worker_block b JOIN job j ON j.id = b.job_id WHERE b.n >= $1 AND j.ended_at IS NULL";
         for row in self.query(sql, values![BLOCK_AFTER]).await? {
-            farm.blocks.insert((row.text(0)?, row.text(1)?));
+            farm.blocks.entry(row.text(0)?).or_default().insert(row.text(1)?);
         }
         for job in farm.jobs.values() {
             if let Some(project) = farm.projects.get_mut(&job.project) {
                 project.running += job.running;
+                project.leases += job.leases;
             }
         }
         Ok(farm)
@@ -65,6 +68,7 @@ impl Store {
                 paused: row.flag(4)?,
                 running_max: row.int_or_null(5)?,
                 running: 0,
+                leases: 0,
                 requires: request.requires,
                 passes: vec![pass],
             };
@@ -90,6 +94,17 @@ impl Store {
                 not_before: row.int(7)?,
             };
             pass.segments.insert(row.int(1)?, segment);
+        }
+        Ok(())
+    }
+
+    async fn load_leases(&self, farm: &mut Farm) -> Result<()> {
+        let sql = "SELECT pass_id, COUNT(*) FROM lease GROUP BY pass_id";
+        for row in self.query(sql, vec![]).await? {
+            let job = farm.passes.get(&row.int(0)?).and_then(|pass| farm.jobs.get_mut(&pass.job));
+            if let Some(job) = job {
+                job.leases += row.int(1)?;
+            }
         }
         Ok(())
     }

@@ -197,13 +197,14 @@ impl Store {
         Ok(completion)
     }
 
-    /// Gives every lease its full time from now on: a coordinator that was away has heard no heartbeats.
+    /// Gives every lease its full time from now on, and no more: a coordinator that was away has heard no heartbeats, and its
+    /// clock may have been put back meanwhile.
     ///
     /// # Errors
     /// When the database refuses.
     pub async fn forgive(&self, ttl_ms: i64, now: i64) -> Result<()> {
         let mut tx = self.begin().await?;
-        let sql = "UPDATE lease SET expires_at = $1 WHERE expires_at < $1";
+        let sql = "UPDATE lease SET expires_at = $1";
         tx.execute(sql.into(), values![now + ttl_ms]).await?;
         self.commit("forgive", tx).await
     }

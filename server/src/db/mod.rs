@@ -80,6 +80,7 @@ impl Store {
     }
 
     async fn begin(&self) -> Result<Tx> {
+        metrics::counter!("pantaray_db_operations_total", "kind" => "transaction").increment(1);
         self.driver.begin().await
     }
 
@@ -92,6 +93,7 @@ impl Store {
     }
 
     async fn query(&self, sql: impl Into<Sql> + Send, values: Vec<Value>) -> Result<Vec<Row>> {
+        metrics::counter!("pantaray_db_operations_total", "kind" => "query").increment(1);
         self.driver.query(sql.into(), values).await
     }
 

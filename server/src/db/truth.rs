@@ -1,7 +1,7 @@
 //! Whether the database agrees with itself: counts equal the rows they count. For tests, and for whoever is in doubt.
 
 use super::Store;
-use crate::Result;
+use crate::{Result, values};
 
 /// A segment whose counts are not those of its batches.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -46,6 +46,15 @@ impl Store {
             }
         }
         Ok(drifts)
+    }
+
+    /// The job of a pass; none where there is no such pass.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn job_of(&self, pass: i64) -> Result<Option<String>> {
+        let row = self.query_one("SELECT job_id FROM pass WHERE id = $1", values![pass]).await?;
+        row.map(|row| row.text(0)).transpose()
     }
 
     /// Batches that are leased to no lease, and leases that count other batches than they have; none, always.

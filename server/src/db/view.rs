@@ -4,6 +4,7 @@ use protocol::admin::WorkerDetail;
 use protocol::job::{BatchDetail, BatchPage, Counts, Failure, JobSummary, PassDetail, SegmentDetail};
 use protocol::{BatchState, FailureClass, JobState, PassKind, PassState};
 
+use super::graph::saved_result;
 use super::{Row, Store, graph};
 use crate::scheduler::farm::WORKER_LOST_MS;
 use crate::{Error, Result, values};
@@ -83,7 +84,8 @@ impl Store {
                 CAST(COALESCE(SUM(s.n_ready), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_leased), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.n_done), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_failed), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
-                CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT)
+                CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT),
+                p.result
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
             GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result ORDER BY p.id";
         let pass = |row: &Row| {
@@ -95,12 +97,25 @@ impl Store {
                 reused: row.flag(4)?,
                 created_at: row.int(5)?,
                 ended_at: row.int_or_null(6)?,
-                result: row.text_or_null(7)?.as_deref().map(graph::found_out).transpose()?,
-                batches: counts(row, 8)?,
-                batch_ms: row.int(13)?,
+use super::graph::saved_result;
+use super::{Row, Store, graph};
             })
         };
         self.query(sql, values![job]).await?.iter().map(pass).collect()
+    }
+
+    /// Mean milliseconds of a batch of the latest bakes; none where there was no bake.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn recent_batch_ms(&self) -> Result<Option<f64>> {
+        let sql =
+            "SELECT CAST(SUM(s.ewma_ms * s.n_done) AS BIGINT), CAST(SUM(s.n_done) AS BIGINT) FROM segment s
+            JOIN (SELECT id FROM pass WHERE kind = 3 ORDER BY id DESC LIMIT 20) AS p ON p.id = s.pass_id
+            WHERE s.ewma_ms > 0 AND s.n_done > 0";
+        let Some(row) = self.query_one(sql, vec![]).await? else { return Ok(None) };
+        let (work, done) = (row.int_or_null(0)?, row.int_or_null(1)?);
+        Ok(work.zip(done).map(|(work, done)| work as f64 / done as f64))
     }
 
     /// Ready batches of a job that must wait after a failure.

@@ -2,7 +2,7 @@
 
 use protocol::work::RegisterRequest;
 
-use super::Store;
+use super::{Row, Store};
 use crate::error::Kind;
 use crate::scheduler::farm::WORKER_LOST_MS;
 use crate::{Error, Result, values};
@@ -18,6 +18,18 @@ pub struct Session {
     pub memory_bytes: i64,
     /// Whether it should finish what it has and claim nothing more.
     pub draining: bool,
+}
+
+/// A session's columns.
+const SESSION: &str = "name, token_id, memory_bytes, draining";
+
+fn session(row: &Row) -> Result<Session> {
+    Ok(Session {
+        worker: row.text(0)?,
+        token: row.text_or_null(1)?,
+        memory_bytes: row.int(2)?,
+        draining: row.flag(3)?,
+    })
 }
 
 /// What an administrator does to a worker.
@@ -71,32 +83,32 @@ impl Store {
     /// # Errors
     /// [`Kind::Gone`] when it is over: the worker must register again and drop what it has.
     pub async fn session(&self, session: &str) -> Result<Session> {
-        let sql = "SELECT name, token_id, memory_bytes, draining FROM worker WHERE session = $1";
+        let sql = format!("SELECT {SESSION} FROM worker WHERE session = $1");
         let row = self.query_one(sql, values![session]).await?;
         let row = row.ok_or_else(|| Error::new(Kind::Gone, "the session is over").hint("register again"))?;
-        Ok(Session {
-            worker: row.text(0)?,
-            token: row.text_or_null(1)?,
-            memory_bytes: row.int(2)?,
-            draining: row.flag(3)?,
-        })
+        self::session(&row)
     }
 
-    /// Notes that workers were heard of.
+    /// Notes that workers were heard of; the processes that have their names now.
     ///
     /// # Errors
     /// When the database refuses.
-    pub async fn seen(&self, workers: &[String], now: i64) -> Result<()> {
+    pub async fn seen(&self, workers: &[String], now: i64) -> Result<Vec<(String, Session)>> {
+        let mut sessions = Vec::with_capacity(workers.len());
         for workers in workers.chunks(500) {
             let mut tx = self.begin().await?;
             let list = super::placeholders(2, workers.len());
-            let sql = format!("UPDATE worker SET last_seen = $1 WHERE name IN ({list})");
+            let sql = format!(
+                "UPDATE worker SET last_seen = $1 WHERE name IN ({list}) RETURNING {SESSION}, session"
+            );
             let mut values = values![now];
             values.extend(workers.iter().map(Into::into));
-            tx.execute(sql.into(), values).await?;
+            for row in tx.query(sql.into(), values).await? {
+                sessions.push((row.text(4)?, session(&row)?));
+            }
             self.commit("seen", tx).await?;
         }
-        Ok(())
+        Ok(sessions)
     }
 
     /// Does something to a worker.

@@ -59,6 +59,7 @@ pub async fn act_on_worker(
         other => return Err(Error::not_found("action", other).hint("`lock`, `unlock` or `drain`")),
     };
     api.coordinator.store.act_on_worker(&name, action).await?;
+    api.coordinator.forget_sessions(&name);
     api.coordinator.changed([]);
     Ok(StatusCode::NO_CONTENT)
 }

@@ -151,8 +151,10 @@ pub async fn job(
     let backing_off = coordinator.store.backing_off(&id, now).await?;
     let question = Question { job: &id, state: summary.state, backing_off };
     let waiting = coordinator.read_farm(|farm| reason(farm, &question, now));
+    let recent_ms = coordinator.store.recent_batch_ms().await?;
     Ok(Json(JobDetail {
         left_ms: left_ms(&passes),
+        left_worker_ms: left_worker_ms(&passes, recent_ms),
         settings: request.settings,
         depends_on: request.depends_on,
         requires: request.requires,
@@ -170,6 +172,20 @@ fn left_ms(passes: &[PassDetail]) -> Option<i64> {
     let known = bakes().any(|pass| pass.batch_ms > 0);
     let work: i64 = bakes().map(|pass| pass.batches.open().saturating_mul(pass.batch_ms)).sum();
     (known && leased > 0).then(|| work / leased)
+}
+
+/// Milliseconds of one worker for the batches that are left; none before they are counted, or where no pace is known.
+fn left_worker_ms(passes: &[PassDetail], recent_ms: Option<f64>) -> Option<i64> {
+    let bakes: Vec<&PassDetail> = passes.iter().filter(|pass| pass.kind == PassKind::Bake).collect();
+    if bakes.is_empty() {
+        return None;
+    }
+    let left = |pass: &&PassDetail| {
+        let own = (pass.batch_ms > 0).then_some(pass.batch_ms as f64);
+        let batch_ms = own.or(recent_ms)?;
+        Some((pass.batches.open() as f64 * batch_ms) as i64)
+    };
+    bakes.iter().map(left).sum()
 }
 
 /// Changes a job's priority, comment or limits.

@@ -1,12 +1,13 @@
 //! Which segments a worker may claim from, best first: fair between projects, by lot and priority between jobs, and
 //! near what the worker has in memory.
 //!
-//! A worker stays on the segment that it walks while its project is within its share. Otherwise the project with the least
-//! of its share running comes first, and its jobs draw lots weighted by priority (Efraimidis and Spirakis, 2006), so
-//! that no job starves. Within a job: what is warm, then its neighbours, then the middle of the widest stretch that nobody
+//! Shares are of workers, not of batches: a project of short batches has no more of the farm than one of long ones. A worker
+//! stays on the segment that it walks while its project and its job are within their shares. Otherwise the project with the
+//! least of its share comes first, and its jobs draw lots weighted by priority (Efraimidis and Spirakis, 2006), so that no
+//! job starves. Within a job: what is warm, then its neighbours, then the middle of the widest stretch that nobody
 //! walks, at last the tail of a segment that another worker walks from its head.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::farm::{Farm, Job, Pass, Segment, Worker};
 
@@ -14,10 +15,12 @@ use super::farm::{Farm, Job, Pass, Segment, Worker};
 pub const CANDIDATES_MAX: usize = 8;
 /// Jobs that are looked at for one claim at most.
 const JOBS_MAX: usize = 16;
-/// A project may go this far over its share while a worker stays where it is, in percent.
-const STAY_PERCENT: i64 = 125;
+/// A project or a job may go this far over its share, and by one worker, while a worker stays where it is.
+const STAY: f64 = 1.25;
 /// Milliseconds that one claim should take.
 const TARGET_MS: i64 = 60_000;
+/// Batches of a claim while nobody knows how long one takes.
+const SAMPLE: i64 = 4;
 
 /// How near a claim is to what the worker has in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -100,34 +103,44 @@ fn stay(farm: &Farm, asker: &Asker<'_>, now: i64) -> Option<Candidate> {
         let found = segments.get(&segment)?;
         let mine = found.owner.as_deref() == Some(asker.name) && found.is_claimable(now);
         let job = farm.jobs.get(job).filter(|job| mine && is_open(farm, job, asker))?;
-        let stays = share_percent(farm, &job.project) <= STAY_PERCENT;
         let count = count(farm, asker, found, job, now);
-        stays.then_some(Candidate { pass, segment, locality: Locality::Own, count })
+        may_stay(farm, job).then_some(Candidate { pass, segment, locality: Locality::Own, count })
     })
 }
 
-/// What a project runs, in percent of what it would run if everybody had their share.
-fn share_percent(farm: &Farm, project: &str) -> i64 {
-    let wants = |name: &str| farm.jobs.values().any(|job| job.project == name);
-    let wanting = farm.projects.iter().filter(|(name, _)| wants(name)).map(|(_, project)| project);
-    let (running, shares) = wanting.fold((0, 0), |sum, p| (sum.0 + p.running, sum.1 + p.share));
-    let Some(project) = farm.projects.get(project) else { return 0 };
-    let fair = running as f64 * project.share as f64 / shares.max(1) as f64;
-    if fair < 1.0 { 100 } else { (100.0 * project.running as f64 / fair) as i64 }
+/// Whether a worker may stay at a job: while its project among projects, and the job among those of its project, has no more
+/// workers than it should.
+fn may_stay(farm: &Farm, job: &Job) -> bool {
+    let (mut wanting, mut weights) = (BTreeSet::new(), 0);
+    for other in farm.jobs.values().filter(|other| !other.paused) {
+        wanting.insert(&other.project);
+        if other.project == job.project {
+            weights += other.priority + 1;
+        }
+    }
+    let projects = wanting.into_iter().filter_map(|name| farm.projects.get(name));
+    let (leases, shares) = projects.fold((0, 0), |sum, p| (sum.0 + p.leases, sum.1 + p.share));
+    let Some(project) = farm.projects.get(&job.project) else { return true };
+    let within = |has: i64, all: i64, part: i64, parts: i64| {
+        has as f64 <= STAY * all as f64 * part as f64 / parts.max(1) as f64 + 1.0
+    };
+    within(project.leases, leases, project.share, shares)
+        && within(job.leases, project.leases, job.priority + 1, weights)
 }
 
 /// Jobs that the worker may work for, in the order in which they are tried.
 fn lottery<'a>(farm: &'a Farm, asker: &Asker<'_>, now: i64, lot: u64) -> Vec<(&'a String, &'a Job)> {
     let claimable = |pass: &i64| farm.passes.get(pass).is_some_and(|p| has_work(p, now));
+    let blocks = farm.blocks.get(asker.name);
     let jobs = farm.jobs.iter().filter(|(id, job)| {
         is_open(farm, job, asker)
-            && !farm.blocks.contains(&(asker.name.to_string(), (*id).clone()))
+            && !blocks.is_some_and(|jobs| jobs.contains(*id))
             && job.passes.iter().any(claimable)
     });
     let mut drawn: Vec<(f64, f64, &String, &Job)> = jobs
         .map(|(id, job)| {
             let project = farm.projects.get(&job.project);
-            let load = project.map_or(0.0, |p| p.running as f64 / p.share.max(1) as f64);
+            let load = project.map_or(0.0, |p| p.leases as f64 / p.share.max(1) as f64);
             // The greatest of u^(1/w) wins with a chance in proportion to w
             let draw = unit(lot, id).ln() / (job.priority + 1) as f64;
             (load, draw, id, job)
@@ -187,15 +200,23 @@ fn widest_stretch(segments: &BTreeMap<i64, Segment>, free: &dyn Fn(&i64) -> bool
     best.get(best.len() / 2).copied()
 }
 
-/// Batches to take: about a minute's worth, single ones when little is left.
+/// Batches to take: about a minute's worth, few while that is not known, single ones when little is left.
 fn count(farm: &Farm, asker: &Asker<'_>, segment: &Segment, job: &Job, now: i64) -> i64 {
-    let worth = if segment.batch_ms > 0 { (TARGET_MS / segment.batch_ms).max(1) } else { asker.max };
-    let left = job.passes.iter().filter_map(|pass| farm.passes.get(pass));
-    let left: i64 =
-        left.flat_map(|pass| pass.segments.values()).map(|segment| segment.ready).take(4096).sum();
+    let (mut left, mut known, mut sum_ms) = (0, 0, 0);
+    let passes = job.passes.iter().filter_map(|pass| farm.passes.get(pass));
+    for other in passes.flat_map(|pass| pass.segments.values()).take(4096) {
+        left += other.ready;
+        known += i64::from(other.batch_ms > 0);
+        sum_ms += other.batch_ms;
+    }
+    let worth = match (segment.batch_ms, known) {
+        (0, 0) => SAMPLE,
+        (0, known) => TARGET_MS / (sum_ms / known).max(1),
+        (batch_ms, _) => TARGET_MS / batch_ms,
+    };
     let fair = (left / farm.alive(now).max(1)).max(1);
     let room = job.running_max.map_or(i64::MAX, |max| (max - job.running).max(1));
-    asker.max.min(worth).min(fair).min(room).clamp(1, protocol::limits::CLAIM_MAX)
+    asker.max.min(worth.max(1)).min(fair).min(room).clamp(1, protocol::limits::CLAIM_MAX)
 }
 
 /// A number in (0, 1] that depends on both (the finaliser of splitmix64).
@@ -222,10 +243,12 @@ mod tests {
                 share: 100,
                 running_max: None,
                 running: 0,
+                leases: 0,
             });
             let project = project.to_string();
-            let (paused, running_max, running, requires) = (false, None, 0, Vec::new());
-            let job = Job { project, priority, paused, running_max, running, requires, passes: vec![pass] };
+            let (paused, running_max, running, leases, requires) = (false, None, 0, 0, Vec::new());
+            let passes = vec![pass];
+            let job = Job { project, priority, paused, running_max, running, leases, requires, passes };
             farm.jobs.insert(id.into(), job);
         }
         for i in 0..4 {
@@ -259,9 +282,9 @@ mod tests {
         farm.projects.get_mut("p").unwrap().share = 300;
         for lot in 0..400 {
             let won = first(&farm, "w0", &[], lot * 77).unwrap();
-            farm.claimed(won.pass, won.segment, "", 0, 1);
+            farm.claimed(won.pass, won.segment, None, 1 + lot as i64 % 7);
         }
-        assert_eq!((farm.projects["p"].running, farm.projects["q"].running), (300, 100));
+        assert_eq!((farm.projects["p"].leases, farm.projects["q"].leases), (300, 100));
     }
 
     /// Catches workers that crowd into one segment, or leave their own while it has work.
@@ -272,13 +295,38 @@ mod tests {
         for (worker, expected) in [("w0", 0), ("w1", 5), ("w2", 3)] {
             let won = first(&farm, worker, &[], 5).unwrap();
             assert_eq!((won.segment, won.locality), (expected, Locality::Cold), "{worker}");
-            farm.claimed(won.pass, won.segment, worker, 9_999, 16);
+            farm.claimed(won.pass, won.segment, Some((worker, 9_999)), 16);
             warm.push((won.pass, won.segment));
         }
         let again = first(&farm, "w1", &warm[1..2], 6).unwrap();
         assert_eq!((again.segment, again.locality), (5, Locality::Own));
         farm.passes.get_mut(&0).unwrap().segments.get_mut(&5).unwrap().ready = 0;
         assert_eq!(first(&farm, "w1", &warm[1..2], 6).unwrap().locality, Locality::Adjacent);
+    }
+
+    /// Catches workers that stay at a job while another of its project, as urgent or more so, gets nobody; and ones that leave
+    /// although all have what is theirs.
+    #[test]
+    fn workers_leave_a_job_that_has_more_than_its_part() {
+        let mut farm = farm(&[("a", "p", 49), ("b", "p", 49)], 4, 100);
+        for worker in ["w0", "w1", "w2", "w3"] {
+            farm.claimed(0, 0, Some((worker, 9_999)), 8);
+        }
+        let stays = |farm: &Farm| first(farm, "w3", &[(0, 0)], 1).unwrap().locality == Locality::Own;
+        assert!(!stays(&farm), "four of four workers");
+        farm.returned(0, 0, 8, 0, true);
+        farm.claimed(1, 0, Some(("w0", 9_999)), 8);
+        assert!(stays(&farm), "three of four, one over its part");
+    }
+
+    /// Catches claims of an hour by workers that cannot know it, and estimates of one segment that others do not use.
+    #[test]
+    fn claims_are_short_until_the_pace_is_known() {
+        let mut farm = farm(&[("a", "p", 50)], 2, 1_000);
+        let count = |farm: &Farm| first(farm, "w0", &[], 1).unwrap().count;
+        assert_eq!(count(&farm), SAMPLE);
+        farm.passes.get_mut(&0).unwrap().segments.get_mut(&1).unwrap().batch_ms = TARGET_MS / 10;
+        assert_eq!(count(&farm), 10);
     }
 
     /// Catches a paused, full or foreign job that is worked for all the same.
@@ -295,7 +343,7 @@ mod tests {
         assert!(closed(&|farm| farm.jobs.get_mut("a").unwrap().running_max = Some(0)));
         assert!(closed(&|farm| farm.projects.get_mut("p").unwrap().running_max = Some(0)));
         assert!(closed(&|farm| farm.jobs.get_mut("a").unwrap().requires = vec!["gpu".into()]));
-        assert!(closed(&|farm| farm.blocks.extend([("w0".into(), "a".into())])));
+        assert!(closed(&|farm| drop(farm.blocks.insert("w0".into(), ["a".into()].into()))));
     }
 
     /// Catches a tail of a pass that one worker keeps to itself while others idle.
@@ -303,7 +351,7 @@ mod tests {
     fn tails_are_shared_and_taken_singly() {
         let mut farm = farm(&[("a", "p", 50)], 1, 3);
         farm.workers.values_mut().for_each(|worker| worker.last_seen = 1_000);
-        farm.claimed(0, 0, "w0", 9_999, 1);
+        farm.claimed(0, 0, Some(("w0", 9_999)), 1);
         let won = first(&farm, "w1", &[], 1).unwrap();
         assert_eq!((won.locality, won.count), (Locality::Steal, 1));
     }

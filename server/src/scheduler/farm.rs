@@ -14,8 +14,8 @@ pub struct Farm {
     pub projects: HashMap<String, Project>,
     /// Workers, by name.
     pub workers: HashMap<String, Worker>,
-    /// Workers that a job does not want any more: worker and job.
-    pub blocks: HashSet<(String, String)>,
+    /// The jobs that do not want a worker any more, by worker.
+    pub blocks: HashMap<String, HashSet<String>>,
 }
 
 /// A project's right to the farm.
@@ -27,6 +27,8 @@ pub struct Project {
     pub running_max: Option<i64>,
     /// Batches that it runs.
     pub running: i64,
+    /// Workers that it has, by their leases.
+    pub leases: i64,
 }
 
 /// A job with open passes.
@@ -42,6 +44,8 @@ pub struct Job {
     pub running_max: Option<i64>,
     /// Batches that it runs.
     pub running: i64,
+    /// Workers that it has, by their leases.
+    pub leases: i64,
     /// Labels that a worker must have.
     pub requires: Vec<String>,
     /// Its open passes.
@@ -124,18 +128,18 @@ impl Farm {
         segments.filter(|segment| segment.is_claimable(now)).map(|segment| segment.ready).take(4096).sum()
     }
 
-    /// A worker has claimed `count` batches.
-    pub fn claimed(&mut self, pass: i64, segment: i64, worker: &str, owner_until: i64, count: i64) {
-        self.change(pass, segment, -count, count);
-        if let Some(segment) = self.segment(pass, segment) {
+    /// A worker has claimed `count` batches; from the head of the segment, it walks it until the time given.
+    pub fn claimed(&mut self, pass: i64, segment: i64, owner: Option<(&str, i64)>, count: i64) {
+        self.change(pass, segment, -count, count, 1);
+        if let (Some((worker, until)), Some(segment)) = (owner, self.segment(pass, segment)) {
             segment.owner = Some(worker.into());
-            segment.owner_until = owner_until;
+            segment.owner_until = until;
         }
     }
 
-    /// `ended` batches are not leased any more, `ready` of them can be claimed again.
-    pub fn returned(&mut self, pass: i64, segment: i64, ended: i64, ready: i64) {
-        self.change(pass, segment, ready, -ended);
+    /// `ended` batches are not leased any more, `ready` of them can be claimed again; their lease may be over.
+    pub fn returned(&mut self, pass: i64, segment: i64, ended: i64, ready: i64, is_over: bool) {
+        self.change(pass, segment, ready, -ended, -i64::from(is_over));
     }
 
     /// A claim came back empty.
@@ -149,14 +153,16 @@ impl Farm {
         self.passes.get_mut(&pass)?.segments.get_mut(&segment)
     }
 
-    fn change(&mut self, pass: i64, segment: i64, ready: i64, running: i64) {
+    fn change(&mut self, pass: i64, segment: i64, ready: i64, running: i64, leases: i64) {
         if let Some(segment) = self.segment(pass, segment) {
             segment.ready = (segment.ready + ready).max(0);
         }
         let Some(job) = self.passes.get(&pass).and_then(|pass| self.jobs.get_mut(&pass.job)) else { return };
         job.running = (job.running + running).max(0);
+        job.leases = (job.leases + leases).max(0);
         if let Some(project) = self.projects.get_mut(&job.project) {
             project.running = (project.running + running).max(0);
+            project.leases = (project.leases + leases).max(0);
         }
     }
 }

@@ -30,7 +30,7 @@ pub fn reason(farm: &Farm, question: &Question<'_>, now: i64) -> WaitReason {
     let alive: Vec<(&String, &Worker)> = farm.workers.iter().filter(|(_, w)| w.is_alive(now)).collect();
     let matching: Vec<&String> =
         alive.iter().filter(|(_, w)| w.has(&job.requires)).map(|(name, _)| *name).collect();
-    let blocked = |name: &&&String| farm.blocks.contains(&((**name).clone(), question.job.to_string()));
+    let blocked = |name: &&&String| farm.blocks.get(**name).is_some_and(|jobs| jobs.contains(question.job));
     let reached = |running: i64, max: Option<i64>| max.is_some_and(|max| running >= max);
     let segments = || job.passes.iter().filter_map(|p| farm.passes.get(p)).flat_map(|p| p.segments.values());
     let ready: i64 = segments().map(|segment| segment.ready).sum();
@@ -70,11 +70,12 @@ mod tests {
             paused: false,
             running_max: Some(1),
             running: 0,
+            leases: 0,
             requires: vec!["gpu".into()],
             passes: vec![0],
         };
         farm.jobs.insert("a".into(), job);
-        farm.projects.insert("p".into(), Project { share: 1, running_max: Some(1), running: 1 });
+        farm.projects.insert("p".into(), Project { share: 1, running_max: Some(1), running: 1, leases: 1 });
         let mut told = vec![reason(&farm, &question, 0)];
         let mut then = |change: &mut dyn FnMut(&mut Farm)| {
             change(&mut farm);
@@ -85,7 +86,7 @@ mod tests {
         then(&mut |farm| farm.projects.get_mut("p").unwrap().running = 0);
         then(&mut |farm| farm.jobs.get_mut("a").unwrap().running = 1);
         then(&mut |farm| farm.jobs.get_mut("a").unwrap().running_max = None);
-        then(&mut |farm| farm.blocks.extend([("w".into(), "a".into())]));
+        then(&mut |farm| drop(farm.blocks.insert("w".into(), ["a".into()].into())));
         then(&mut |farm| farm.jobs.get_mut("a").unwrap().paused = true);
         use WaitReason::{AllWorkersBlocked, Capacity, Flowing, Limit, NoMatch, NoWorker, Paused, Quota};
         assert_eq!(told, [NoWorker, NoMatch, Quota, Capacity, Limit, Flowing, AllWorkersBlocked, Paused]);

@@ -40,6 +40,10 @@ fn a_request_is_checked_before_anything_is_stored() {
             client.post("/v1/jobs/validate", &good, std::time::Duration::ZERO).unwrap();
         let names: Vec<&str> = estimate.sets.iter().map(|set| set.name.as_str()).collect();
         assert_eq!((names, estimate.input_bytes), (vec!["hill", "tent"], super::TENT.len() as u64));
+        // 16 rays a point: 65,536 points a batch; what a file holds is not known before it is imported
+        let known: Vec<_> = estimate.sets.iter().map(|set| (set.points, set.batches)).collect();
+        assert_eq!(known, [(Some(22_755), Some(1)), (None, None)]);
+        assert_eq!((estimate.batches, estimate.worker_seconds), (None, None));
         let refuse = |change: &dyn Fn(&mut protocol::job::JobRequest), status| {
             let mut request = good.clone();
             change(&mut request);

@@ -132,6 +132,14 @@ impl Client {
         self.ask("PATCH", path, Some(encode(body)?), &[], Duration::ZERO)
     }
 
+    /// PUTs `body` at `path`.
+    ///
+    /// # Errors
+    /// As [`get`](Self::get).
+    pub fn put<R: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> Result<R> {
+        self.ask("PUT", path, Some(encode(body)?), &[], Duration::ZERO)
+    }
+
     /// A request whose answer is JSON, or empty, which reads as `null`.
     fn ask<R: DeserializeOwned>(
         &self,
