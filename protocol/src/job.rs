@@ -256,13 +256,11 @@ pub struct PassDetail {
     pub reused: bool,
     /// Mean milliseconds of a batch.
     pub batch_ms: i64,
-    /// What it found out, such as how many batches and points there are, and of how many bytes its result is.
-    pub result: Option<PassResult>,
     /// When it was made.
     pub created_at: i64,
     /// When it ended.
     pub ended_at: Option<i64>,
-    /// What it found out.
+    /// What it found out, such as how many batches and points there are, and of how many bytes its result is.
     #[serde(default)]
     pub result: Option<PassResult>,
 }

@@ -54,12 +54,6 @@ pub(super) fn found_out(saved: &str) -> Result<PassResult> {
     Ok(serde_json::from_str::<Saved>(saved)?.result)
 }
 
-/// The result in what the database has of it.
-pub(super) fn saved_result(json: Option<String>) -> Result<Option<PassResult>> {
-    let saved = json.map(|json| serde_json::from_str::<Saved>(&json)).transpose()?;
-    Ok(saved.map(|saved| saved.result))
-}
-
 /// What is known of a job besides its graph.
 struct Head {
     id: String,

@@ -4,7 +4,6 @@ use protocol::admin::WorkerDetail;
 use protocol::job::{BatchDetail, BatchPage, Counts, Failure, JobSummary, PassDetail, SegmentDetail};
 use protocol::{BatchState, FailureClass, JobState, PassKind, PassState};
 
-use super::graph::saved_result;
 use super::{Row, Store, graph};
 use crate::scheduler::farm::WORKER_LOST_MS;
 use crate::{Error, Result, values};
@@ -84,8 +83,7 @@ impl Store {
                 CAST(COALESCE(SUM(s.n_ready), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_leased), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.n_done), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_failed), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
-                CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT),
-                p.result
+                CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT)
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
             GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result ORDER BY p.id";
         let pass = |row: &Row| {
@@ -97,8 +95,9 @@ impl Store {
                 reused: row.flag(4)?,
                 created_at: row.int(5)?,
                 ended_at: row.int_or_null(6)?,
-use super::graph::saved_result;
-use super::{Row, Store, graph};
+                result: row.text_or_null(7)?.as_deref().map(graph::found_out).transpose()?,
+                batches: counts(row, 8)?,
+                batch_ms: row.int(13)?,
             })
         };
         self.query(sql, values![job]).await?.iter().map(pass).collect()
