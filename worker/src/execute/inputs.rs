@@ -131,7 +131,8 @@ impl Executor {
         make(&root.join("scene"))?;
         make(&links)?;
         std::fs::write(&path, &files.scene).map_err(|error| engine::Error::io("write", &path, error))?;
-        for name in files.files.keys().map(|name| root.join("scene").join(name)).filter(|name| !name.exists()) {
+        for name in files.files.keys().map(|name| root.join("scene").join(name)).filter(|name| !name.exists())
+        {
             make(name.parent().unwrap_or(root))?;
             std::fs::File::create_new(&name).map_err(|error| engine::Error::io("create", &name, error))?;
         }
