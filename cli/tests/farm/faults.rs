@@ -68,8 +68,9 @@ fn a_worker_dies_before_it_hears_the_answer() {
 fn a_full_disk_costs_its_worker_only() {
     let mut farm = Farm::start();
     farm.cramped_worker("cramped", 256);
-    farm.worker("other");
     let job = farm.submit(1);
+    farm.until_said("cramped", "File too large");
+    farm.worker("other");
     farm.wait(&job);
     farm.expect_same(&job);
 }

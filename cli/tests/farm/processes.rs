@@ -274,6 +274,15 @@ impl Farm {
         assert!(self.fetch(job).1 == *baked, "the farm's bytes differ\n{}", self.logs());
     }
 
+    /// Waits until a process has said something.
+    pub fn until_said(&self, name: &str, words: &str) {
+        let start = Instant::now();
+        while !self.log(name).contains(words) {
+            assert!(start.elapsed() < PATIENCE, "{}", self.logs());
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
     /// What a process has said so far.
     pub fn log(&self, name: &str) -> String {
         std::fs::read_to_string(self.at(&format!("{name}.log"))).unwrap_or_default()
