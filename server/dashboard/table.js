@@ -113,7 +113,9 @@ export class Table {
     for (let index = first; index < last; index += 1) {
       const row = this.row(index);
       if (!row) {
-        this.load(Math.floor(index / PAGE)).then(() => this.draw());
+        // Drawn again once for each page that comes, however many of its rows are missing
+        const page = Math.floor(index / PAGE);
+        if (!this.asked.has(page)) this.load(page).then(() => this.draw());
         continue;
       }
       const id = this.id(row);

@@ -3,7 +3,7 @@
 import { h } from "/dashboard/dom.js";
 
 const STATES = {
-  blocked: ["⋯", "Waits for another job", "quiet"],
+  blocked: ["⋯", "Blocked", "quiet"],
   ready: ["○", "Ready", "ready"],
   running: ["▶", "Running", "running"],
   cancelling: ["⊘", "Being cancelled", "quiet"],

@@ -6,8 +6,6 @@
 
 pub mod file;
 mod sample;
-#[cfg(test)]
-mod tests;
 mod tree;
 
 use std::path::Path;

@@ -69,6 +69,7 @@ export async function show(main, context) {
     const jobs = () => [...table.pages.values()].flat().filter((job) => selection.has(job.id));
     put(actions, h("strong", {}, `${count(selection.size)} selected`), bulk(jobs, () => table.refresh()), h("button", { class: "plain", onclick: () => table.selectAll(false) }, "Clear"));
   };
+  let typing = 0;
   const apply = async () => {
     history.replaceState(null, "", query("/jobs", { search: filter.search, state: filter.state, project: filter.project, sort: filter.sort === "created" ? "" : filter.sort, order: filter.order === "desc" ? "" : filter.order }));
     table.drawHead(filter.sort, filter.order);
@@ -76,10 +77,10 @@ export async function show(main, context) {
     sayCount(counter, table, "job");
   };
   const changed = () => {
+    clearTimeout(typing);
     Object.assign(filter, { search: search.value.trim(), state: state.value, project: project.value });
     apply();
   };
-  let typing = 0;
   search.addEventListener("input", () => { clearTimeout(typing); typing = setTimeout(changed, 200); });
   state.addEventListener("change", changed);
   project.addEventListener("change", changed);

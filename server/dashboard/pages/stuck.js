@@ -41,7 +41,7 @@ function drawJobs(element, jobs) {
   const sorted = [...groups].sort((a, b) => b[1].length - a[1].length);
   put(element, h("h2", {}, "What holds jobs up"), sorted.length === 0 ? h("p", {}, h("span", { class: "tone-done" }, "✓ "), "Every live job flows.") : sorted.map(([why, held]) => h("div", { class: "held" },
     h("h3", {}, `${reason(why)} `, h("span", { class: "quiet" }, count(held.length))), h("p", { class: "quiet" }, remedy(why)),
-    h("ul", {}, held.slice(0, 20).map((job) => h("li", {}, h("a", { href: `/jobs/${job.id}` }, job.name), h("small", { class: "quiet" }, ` ${job.project} · ${job.submitted_by} · waits since ${span(now() - job.created_at)}${job.reason ? ` · ${job.reason}` : ""}`))), held.length > 20 && h("li", { class: "quiet" }, `and ${count(held.length - 20)} more`)))));
+    h("ul", {}, held.slice(0, 20).map((job) => h("li", {}, h("a", { href: `/jobs/${job.id}` }, job.name), h("small", { class: "quiet" }, ` ${job.project} · ${job.submitted_by} · for ${span(now() - job.created_at)}${job.reason ? ` · ${job.reason}` : ""}`))), held.length > 20 && h("li", { class: "quiet" }, `and ${count(held.length - 20)} more`)))));
 }
 
 export async function show(main, context) {

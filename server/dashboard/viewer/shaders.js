@@ -75,7 +75,7 @@ void main() {
   vec3 place = u_corner + u_edge * a_place;
   gl_Position = u_clip * vec4(place, 1.0);
   int octant = (a_place.x >= 0.5 ? 1 : 0) + (a_place.y >= 0.5 ? 2 : 0) + (a_place.z >= 0.5 ? 4 : 0);
-  gl_PointSize = clamp(1.7 * u_spacing[octant] * u_pixels / max(gl_Position.w, 1e-6), 1.5, 48.0);
+  gl_PointSize = clamp(2.0 * u_spacing[octant] * u_pixels / max(gl_Position.w, 1e-6), 1.5, 48.0);
   v_id = ivec2(u_node, gl_VertexID);
   float v[${count}];
   ${unpack}

@@ -1,13 +1,12 @@
-//! Previews of small streams, read back.
+//! Previews of small streams, written and read back.
 
 use std::path::Path;
 
+use engine::preview::{NODE_BYTES_MAX, Preview, write_preview};
+use engine::scene::{Domain, UpAxis, Weight};
+use engine::stream::file::{MgsReader, MgsWriter};
+use engine::stream::{Attribute, Microgrid, Schema, ValueType};
 use glam::{DVec3, Vec3};
-
-use super::*;
-use crate::scene::{Domain, UpAxis, Weight};
-use crate::stream::file::MgsWriter;
-use crate::stream::{Attribute, Microgrid, Schema, ValueType};
 
 /// A stream of `count` points on a wavy sheet 100 units wide, a kilometre from the origin, of which every `hole`-th has no
 /// result. The first coefficient of a point is its x.
@@ -41,8 +40,26 @@ fn stream(path: &Path, count: usize, hole: usize) -> MgsReader {
     MgsReader::open(path).unwrap()
 }
 
+/// A finite 16-bit float.
 fn f16(bytes: &[u8]) -> f32 {
-    half::f16::from_le_bytes(bytes.try_into().unwrap()).to_f32()
+    let bits = u16::from_le_bytes(bytes.try_into().unwrap());
+    let (exponent, fraction) = (i32::from(bits >> 10 & 31), f32::from(bits & 1023));
+    let size = if exponent == 0 {
+        fraction * 2f32.powi(-24)
+    } else {
+        (1.0 + fraction / 1024.0) * 2f32.powi(exponent - 15)
+    };
+    if bits >> 15 == 1 { -size } else { size }
+}
+
+/// A normal as a record has it.
+fn normal(bytes: &[u8]) -> Vec3 {
+    let at = |at: usize| f32::from(i16::from_le_bytes([bytes[at], bytes[at + 1]])) / 32_767.0;
+    let (x, y) = (at(0), at(2));
+    let z = 1.0 - x.abs() - y.abs();
+    let fold = (-z).max(0.0);
+    let inward = |value: f32| if value < 0.0 { value + fold } else { value - fold };
+    Vec3::new(inward(x), inward(y), z).normalize()
 }
 
 /// Catches points that are lost, doubled or moved, coefficients that go to another point, and nodes that a viewer would
@@ -82,6 +99,7 @@ fn every_point_is_where_it_was() {
             assert!((place.z - (x * 0.1).sin()).abs() < 0.01);
             assert_eq!((f16(&record[16..18]), f16(&record[30..32])), (1.5, -0.25));
             assert_eq!(record[10..14], [255, 188, 0, 0]);
+            assert!((normal(&record[6..10]) - Vec3::new(0.0, 0.6, -0.8)).length() < 1e-4);
             seen.push((place.y * 1e4) as i64);
         }
     }
@@ -141,27 +159,8 @@ fn odd_streams_have_an_end() {
     let target = folder.path().join("out.preview");
     let mut nothing = stream(&folder.path().join("a.mgs"), 200, 1);
     let error = write_preview(&mut nothing, &target, 1 << 30, &mut |_| {}).unwrap_err();
-    assert_eq!(error.kind(), crate::ErrorKind::NotFound);
+    assert_eq!(error.kind(), engine::ErrorKind::NotFound);
     let mut single = stream(&folder.path().join("b.mgs"), 2, 2);
     assert_eq!(write_preview(&mut single, &target, 1 << 30, &mut |_| {}).unwrap().points, 1);
     Preview::open(&target).unwrap();
-}
-
-/// Catches normals that lean: the fold of the octahedron, and what stands for no normal.
-#[test]
-fn normals_survive() {
-    let decode = |[x, y]: [i16; 2]| {
-        let (x, y) = (f32::from(x) / 32_767.0, f32::from(y) / 32_767.0);
-        let z = 1.0 - x.abs() - y.abs();
-        let fold = (-z).max(0.0);
-        let sign = |value: f32| if value < 0.0 { -1.0 } else { 1.0 };
-        Vec3::new(x - sign(x) * fold, y - sign(y) * fold, z).normalize()
-    };
-    for at in 0..500 {
-        let z = 1.0 - (at as f32 + 0.5) / 250.0;
-        let (s, c) = (at as f32 * 2.399_963).sin_cos();
-        let normal = Vec3::new((1.0 - z * z).sqrt() * c, (1.0 - z * z).sqrt() * s, z);
-        assert!((decode(sample::octahedral(normal)) - normal).length() < 1e-4, "{normal}");
-    }
-    assert_eq!(sample::octahedral(Vec3::ZERO), [i16::MIN; 2]);
 }
