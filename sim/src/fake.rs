@@ -180,7 +180,8 @@ impl Fake {
     /// Sleeps through the batches of a claim and reports them, some at a time.
     fn bake(&mut self, session: &mut Session, claim: &Claim) {
         let Some(load) = self.shared.loads.get(claim.task.settings.seed) else { return };
-        if let Some(freeze) = self.temper.freezes.take() {
+        let frozen = self.temper.freezes.take();
+        if let Some(freeze) = frozen {
             std::thread::sleep(freeze);
             session.next_beat = Instant::now();
         }
@@ -201,7 +202,9 @@ impl Fake {
                 load: claim.task.settings.seed,
             };
             self.shared.ledger.seen().spent.push(spent);
-            if self.leaves() || session.is_over || !session.leases.contains(&claim.lease) {
+            // Who was frozen does not know better than to report
+            let is_live = frozen.is_some() || session.leases.contains(&claim.lease);
+            if self.leaves() || session.is_over || !is_live {
                 return;
             }
             let items = group.iter().map(|batch| CompleteItem {

@@ -41,7 +41,7 @@ fn named(name: &str) -> Result<&'static Scenario, String> {
 
 /// Runs scenarios, one after the other.
 pub fn run(arguments: &Arguments, console: &Console) -> Result<Answer> {
-    let chosen =
+    let chosen: Vec<&Scenario> =
         if arguments.scenario.is_empty() { ALL.iter().collect() } else { arguments.scenario.clone() };
     let program = std::env::current_exe().map_err(|error| {
         Error::new(ErrorKind::Io, "this program cannot be started again").caused_by(error)

@@ -1,5 +1,4 @@
-//! The scenarios: what a crew does to coordinators, and what must come of it. Each was seen to fail with the feature that
-//! it watches taken out; `docs/simulator.md` says how.
+//! The scenarios: what a crew does to coordinators, and what must come of it; `docs/simulator.md` says why.
 
 mod absence;
 mod flow;

@@ -7,7 +7,9 @@ use sim::fake::Temper;
 use sim::stage::{Stage, submit};
 use sim::wire::Wire;
 
-use crate::{PATIENCE, end, load, postgres, set, succeeds};
+use sim::load::Load;
+
+use crate::{PATIENCE, end, postgres, set, succeeds};
 
 /// Commits that a farm at work comes to, and which passing of each is the last.
 const POINTS: &[(&str, u64)] = &[
@@ -23,6 +25,11 @@ const POINTS: &[(&str, u64)] = &[
     ("expire", 1),
     ("publish", 1),
 ];
+/// Batches long enough for some heartbeats.
+fn load(batches: i64) -> Load {
+    Load::new(batches, 60.0, 10_000)
+}
+
 /// Stages at once.
 const AT_ONCE: usize = 6;
 
