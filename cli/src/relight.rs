@@ -39,6 +39,9 @@ pub struct Arguments {
     /// The attribute of visibility coefficients [default: the one named after occlusion]
     #[arg(long, value_name = "NAME")]
     attribute: Option<String>,
+    /// Draw an attribute's own values instead of light: one is a grey, the first three of several are a colour
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["attribute", "weight"])]
+    show: Option<String>,
     /// Samples per pixel along each axis
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=4))]
     supersampling: u32,
@@ -105,9 +108,12 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
     options.rotation_degrees = arguments.rotate;
     options.exposure_stops = arguments.exposure;
     options.supersampling = arguments.supersampling;
-    options.background = !arguments.no_background;
+    options.background = !arguments.no_background && arguments.show.is_none();
     options.attribute = arguments.attribute;
-    learn_how_it_was_baked(&reader, &mut options).map_err(|error| error.at(&arguments.input))?;
+    options.shown = arguments.show;
+    if options.shown.is_none() {
+        learn_how_it_was_baked(&reader, &mut options).map_err(|error| error.at(&arguments.input))?;
+    }
     if let Some(weight) = arguments.weight {
         options.weight = weight.into();
     }
@@ -219,7 +225,7 @@ impl Relit {
 
     fn describe(&self) -> String {
         let mut text = format!(
-            "{}: {} × {}, {} faces of {} grids in view, lit by `{}`",
+            "{}: {} × {}, {} faces of {} grids in view, by `{}`",
             self.output.display(),
             self.width,
             self.height,

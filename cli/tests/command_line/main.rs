@@ -146,6 +146,28 @@ fn an_example_is_baked_compared_and_lit() {
     assert_eq!(manifest["micropolygons"], report["micropolygons"]);
 }
 
+/// Catches an output that is not what its shader computes, is traced once more, or cannot be looked at.
+#[test]
+fn shaders_have_outputs() {
+    let desk = Desk::new();
+    let scene = repository("examples/shaders.xml").to_string_lossy().into_owned();
+    let sizes = ["--max-points", "4096", "--samples", "64", "--memory", "256MiB"];
+    let report = json(["bake", &scene, "-o", &desk.at("out")].into_iter().chain(sizes));
+    assert_eq!(number(&report, "/bake/rays"), 64.0 * number(&report, "/bake/points"), "{report}");
+    let baked = desk.at("out/ground.mgs");
+    let summary = json(["inspect", &baked]);
+    let of = |name: &str| {
+        let mut attributes = summary["attributes"].as_array().expect("attributes").iter();
+        attributes.find(|attribute| attribute["name"] == name).cloned().expect(name)
+    };
+    // Over the hemisphere band 1 points to what is open, and points that were not baked are zero
+    assert_eq!((&of("ambient")["components"], &of("bent_normal")["components"]), (&1.into(), &3.into()));
+    assert!((0.3..=1.0).contains(&number(&of("ambient"), "/max/0")), "{summary}");
+    assert!(number(&of("bent_normal"), "/max/1") > 0.8, "{summary}");
+    json(["relight", &baked, "-o", &desk.at("ambient.png"), "--show", "ambient", "--size", "64x36"]);
+    assert!(std::fs::read(desk.at("ambient.png")).unwrap().starts_with(b"\x89PNG"));
+}
+
 /// Catches a brick map that `build` leaves where `bake` does not find it.
 #[test]
 fn a_bake_reuses_what_build_has_built() {

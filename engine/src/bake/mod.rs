@@ -7,7 +7,9 @@ pub mod folder;
 pub mod frames;
 pub mod inputs;
 pub mod map;
+mod run;
 pub mod set;
+pub mod tracer;
 pub mod work;
 
 use std::path::Path;

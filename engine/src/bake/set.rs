@@ -3,21 +3,19 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-use std::time::Instant;
 
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use super::inputs::Inputs;
 use super::map::occluders_of;
-use super::work::BakeWork;
+use super::run::{Column, Run, Runs};
+use super::tracer::BatchTracer;
 use super::{BakeOptions, Control};
-use crate::batch::{BatchPlan, KeepAll, Point, RAYS_PER_BATCH_MAX, SplitOptions, evenly_spaced, split};
+use crate::batch::{BatchPlan, KeepAll, RAYS_PER_BATCH_MAX, SplitOptions, evenly_spaced, split};
 use crate::brickmap::BrickMap;
-use crate::output::{MergeOptions, MergeReport, Part, PartFormat, PartSource, merge};
-use crate::scene::{BakeSet, Scene, Shader, ShaderKind};
-use crate::stream::Attribute;
-use crate::trace::{Backend, Shading, TraceOptions};
+use crate::output::{MergeOptions, MergeReport, PartFormat, PartSource, merge};
+use crate::scene::{BakeSet, Scene, ShOcclusion, ShaderKind};
+use crate::trace::{Backend, TraceOptions};
 use crate::{Error, Result};
 
 /// A bake set with everything that its results depend on.
@@ -87,7 +85,7 @@ impl<'a> SetBake<'a> {
         if let Ok(plan) = BatchPlan::open(folder) {
             return Ok(plan);
         }
-        let samples = self.shadings(0)?.iter().map(|shading| shading.shader.samples).max().unwrap_or(1);
+        let samples = self.runs(0)?.runs.iter().map(|run| run.samples).max().unwrap_or(1);
         let options = SplitOptions {
             bake_set: self.bake_set.name.clone(),
             points_per_batch_max: (RAYS_PER_BATCH_MAX / samples).max(1),
@@ -111,7 +109,9 @@ impl<'a> SetBake<'a> {
     pub fn format(&self, plan: &BatchPlan) -> Result<PartFormat> {
         let bake =
             xxh3_64(format!("{:016x} {} {:016x}", self.identity, self.bake_set.name, plan.hash()).as_bytes());
-        PartFormat::new(bake, &self.attributes(&self.shadings(0)?), plan.points_per_batch_max())
+        let columns = self.runs(0)?.columns;
+        let attributes: Vec<_> = columns.into_iter().map(|column| column.attribute).collect();
+        PartFormat::new(bake, &attributes, plan.points_per_batch_max())
     }
 
     /// What traces the batches of `plan` through `map`, which is that of the set's occluders.
@@ -120,7 +120,7 @@ impl<'a> SetBake<'a> {
     /// When the arena cannot be made, or a shader is unknown.
     pub fn tracer(&self, plan: Arc<BatchPlan>, map: Arc<BrickMap>) -> Result<BatchTracer> {
         let stream = self.occluders.iter().position(|&geometry| geometry == self.geometry);
-        let shadings = self.shadings(stream.map_or(0, |stream| map.shift(stream)))?;
+        let runs = self.runs(stream.map_or(0, |stream| map.shift(stream)))?;
         let options = TraceOptions {
             lod: self.options.lod,
             seed: self.options.seed,
@@ -130,9 +130,7 @@ impl<'a> SetBake<'a> {
         let arena_bytes = arena_bytes(self.options, &map);
         let device = self.options.device;
         let backend = Backend::new(device, map, arena_bytes, options, self.scene.meters_per_unit)?;
-        let (format, values) = (self.format(&plan)?, vec![Vec::new(); shadings.len()]);
-        let (points, next_points, row) = Default::default();
-        Ok(BatchTracer { plan, shadings, format, backend, points, next: None, next_points, values, row })
+        Ok(BatchTracer::new(self.format(&plan)?, plan, runs, backend))
     }
 
     /// Merges parts into the decorated stream `target`, which appears when it is complete. With `holes`, points may lack
@@ -154,51 +152,32 @@ impl<'a> SetBake<'a> {
             scratch,
             memory_bytes: self.options.memory_bytes / 4,
             partial: holes || self.options.points_max.is_some(),
-            metadata: &self.metadata(&self.shadings(0)?),
+            metadata: &self.metadata(&self.runs(0)?),
         };
         merge(stream.as_mut(), plan, parts, &options, target, &mut control.stage("merge"))
     }
 
-    /// The shaders of the set's attributes, with the samples that the options ask for; `shift` is that of the points'
-    /// own stream in the brick map.
-    fn shadings(&self, shift: u8) -> Result<Vec<Shading>> {
-        let shading = |name: &str| {
-            let Shader { kind, .. } = self.scene.shaders.iter().find(|shader| shader.name == name)?;
-            match kind {
-                ShaderKind::ShOcclusion(shader) => {
-                    let mut shader = shader.clone();
-                    shader.samples = self.options.samples.unwrap_or(shader.samples);
-                    Some(Shading::new(&shader, self.options.seed, &self.bake_set.name, shift))
-                }
-            }
-        };
-        let unknown =
-            |name: &str| Error::invalid(format!("no shader is called `{name}`")).at(&self.scene.path);
-        let attributes = self.bake_set.attributes.iter();
-        attributes.map(|a| shading(&a.shader).ok_or_else(|| unknown(&a.shader))).collect()
+    /// The shaders and attributes of the set; `shift` is that of the points' own stream in the brick map.
+    fn runs(&self, shift: u8) -> Result<Runs> {
+        Runs::new(self.scene, self.options, self.bake_set, shift)
     }
 
-    /// The output's new attributes.
-    fn attributes(&self, shaders: &[Shading]) -> Vec<Attribute> {
-        let pairs = self.bake_set.attributes.iter().zip(shaders);
-        pairs
-            .map(|(a, shading)| {
-                Attribute::vertex(&a.name, shading.shader.storage, shading.coefficients() as u16)
-            })
-            .collect()
-    }
-
-    /// What the output says about its spherical harmonics.
-    fn metadata(&self, shaders: &[Shading]) -> Vec<(String, String)> {
+    /// What the output says about its new attributes.
+    fn metadata(&self, runs: &Runs) -> Vec<(String, String)> {
         let mut metadata = vec![(
             "sh.convention".into(),
             "real orthonormal, index l(l+1)+m, no Condon-Shortley phase".into(),
         )];
-        for (attribute, Shading { shader, .. }) in self.bake_set.attributes.iter().zip(shaders) {
+        for Column { run, output, attribute } in &runs.columns {
+            let Run { shader, samples, .. } = &runs.runs[*run];
             let of = |what: &str| format!("{}.{what}", attribute.name);
-            metadata.push((of("shader"), "sh_occlusion".into()));
-            metadata.push((of("bands"), shader.bands.to_string()));
-            metadata.push((of("samples"), shader.samples.to_string()));
+            metadata.push((of("shader"), shader.kind.type_name().into()));
+            metadata.push((of("output"), output.name.clone()));
+            metadata.push((of("samples"), samples.to_string()));
+            let ShaderKind::ShOcclusion(shader) = &shader.kind;
+            if output.name == ShOcclusion::COEFFICIENTS {
+                metadata.push((of("bands"), shader.bands.to_string()));
+            }
             metadata.push((of("domain"), format!("{:?}", shader.domain).to_lowercase()));
             metadata.push((of("weight"), format!("{:?}", shader.weight).to_lowercase()));
         }
@@ -207,79 +186,6 @@ impl<'a> SetBake<'a> {
             own.filter(|(key, _)| metadata.iter().all(|(known, _)| known != key)).cloned().collect();
         metadata.extend(own);
         metadata
-    }
-}
-
-/// Traces batches of one plan, one after the other; keeps what it has loaded.
-pub struct BatchTracer {
-    plan: Arc<BatchPlan>,
-    shadings: Vec<Shading>,
-    format: PartFormat,
-    backend: Backend,
-    points: Vec<Point>,
-    /// The batch whose points are the next ones.
-    next: Option<u32>,
-    next_points: Vec<Point>,
-    values: Vec<Vec<f32>>,
-    row: Vec<f32>,
-}
-
-impl BatchTracer {
-    /// What the parts have in common.
-    pub fn format(&self) -> &PartFormat {
-        &self.format
-    }
-
-    /// Says which batch is traced after the coming one, so that its bricks can be loaded meanwhile.
-    ///
-    /// # Errors
-    /// When the plan is damaged.
-    pub fn expect(&mut self, next: Option<u32>) -> Result<()> {
-        self.next = next;
-        match next {
-            Some(batch) => self.plan.read(batch as usize, &mut self.next_points),
-            None => Ok(()),
-        }
-    }
-
-    /// Traces `batch`, becomes its part, and adds to `work`. The part depends on the batch alone.
-    ///
-    /// # Errors
-    /// When the plan or the brick map is damaged, or `cancel` is set.
-    pub fn trace(
-        &mut self,
-        batch: u32,
-        part: &mut Part,
-        work: &mut BakeWork,
-        cancel: &AtomicBool,
-    ) -> Result<()> {
-        let start = Instant::now();
-        self.plan.read(batch as usize, &mut self.points)?;
-        for (number, (shading, values)) in self.shadings.iter().zip(&mut self.values).enumerate() {
-            values.resize(self.points.len() * shading.coefficients(), 0.0);
-            let next = match self.shadings.get(number + 1) {
-                Some(shading) => Some((&self.points[..], shading)),
-                None => self.next.map(|_| (&self.next_points[..], &self.shadings[0])),
-            };
-            work.add(&self.backend.trace(&self.points, shading, next, cancel, values)?);
-        }
-        part.start(batch, self.points.iter().map(|point| point.index), &self.format);
-        for point in 0..self.points.len() {
-            self.row.clear();
-            for (shading, values) in self.shadings.iter().zip(&self.values) {
-                let count = shading.coefficients();
-                self.row.extend_from_slice(&values[point * count..(point + 1) * count]);
-            }
-            part.set_row(&self.format, point, &self.row);
-        }
-        work.batches += 1;
-        work.seconds += start.elapsed().as_secs_f64();
-        Ok(())
-    }
-
-    /// Adds to `work` what the arena has done since the tracer was made.
-    pub fn finish(&self, work: &mut BakeWork) {
-        work.add_backend(&self.backend);
     }
 }
 

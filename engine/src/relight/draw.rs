@@ -29,7 +29,25 @@ const POINT_RADIUS_MIN_PIXELS: f32 = 1.0;
 const LINE_RADIUS_MIN_PIXELS: f32 = 0.5;
 
 /// How vertices get their colour.
-pub struct Shading {
+pub enum Shading {
+    /// By the light that they reflect.
+    Lit(Lit),
+    /// By an attribute's own values, of this column: one is a grey, the first three of several are a colour.
+    Shown(usize),
+}
+
+impl Shading {
+    /// The column of the attribute that is drawn.
+    pub fn column(&self) -> usize {
+        match self {
+            Self::Lit(lit) => lit.column,
+            Self::Shown(column) => *column,
+        }
+    }
+}
+
+/// How light becomes colour.
+pub struct Lit {
     /// From visibility to radiance.
     pub transfer: Transfer,
     /// The column of visibility coefficients.
@@ -149,6 +167,11 @@ pub fn draw<P: Paint>(
     }
 }
 
+/// A radiance that can be drawn: negative values are the basis ringing; what is not finite would spread to whole pixels.
+fn drawable(value: f32) -> f32 {
+    if value > 0.0 && value < RADIANCE_MAX { value } else { 0.0 }
+}
+
 /// Memory for clipping.
 #[derive(Default)]
 struct Scratch {
@@ -184,8 +207,10 @@ impl Slot {
         self.baked.extend((0..count).map(|vertex| columns.is_baked(schema, grid, vertex)));
         self.vertices.iter_mut().for_each(|vertex| view.project(vertex));
         self.find_rows(view, radius);
-        if let Some(shading) = shading {
-            self.shade(schema, columns, view, shading);
+        match shading {
+            Some(Shading::Lit(lit)) => self.shade(schema, columns, view, lit),
+            Some(Shading::Shown(column)) => self.show(schema, *column),
+            None => {}
         }
     }
 
@@ -205,7 +230,19 @@ impl Slot {
         self.rows = [low.max(0) as usize, high.max(0) as usize];
     }
 
-    fn shade(&mut self, schema: &Schema, columns: &Columns, view: &View, shading: &Shading) {
+    /// Colours vertices by the values of a column.
+    fn show(&mut self, schema: &Schema, column: usize) {
+        let components = usize::from(schema.attributes[column].components);
+        for (index, vertex) in self.vertices.iter_mut().enumerate().filter(|(index, _)| self.baked[*index]) {
+            vertex.rgb = std::array::from_fn(|i| {
+                let component = if components == 1 { 0 } else { i };
+                let is_there = component < components;
+                drawable(if is_there { self.grid.unit_value(schema, column, index, component) } else { 0.0 })
+            });
+        }
+    }
+
+    fn shade(&mut self, schema: &Schema, columns: &Columns, view: &View, shading: &Lit) {
         let grid = &self.grid;
         let to_world = view.axes();
         if columns.normal.is_none() {
@@ -238,11 +275,7 @@ impl Slot {
                 None => [ALBEDO_DEFAULT; 3],
             };
             let white = shading.transfer.radiance(normal, &visibility);
-            vertex.rgb = std::array::from_fn(|i| {
-                let value = white[i] * albedo[i];
-                // Negative values are the basis ringing; what is not finite would spread to whole pixels.
-                if value > 0.0 && value < RADIANCE_MAX { value } else { 0.0 }
-            });
+            vertex.rgb = std::array::from_fn(|i| drawable(white[i] * albedo[i]));
         }
     }
 

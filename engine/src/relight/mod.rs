@@ -25,7 +25,7 @@ pub use visible::{Visible, VisibleFaces, visible_faces};
 #[cfg(test)]
 mod tests;
 
-use draw::{Columns, Shading};
+use draw::{Columns, Lit, Shading};
 use raster::Sample;
 use view::View;
 
@@ -59,6 +59,8 @@ pub struct RelightOptions {
     pub exposure_stops: f32,
     /// The attribute of visibility coefficients; none means the one whose name says so.
     pub attribute: Option<String>,
+    /// An attribute whose own values are drawn instead of light.
+    pub shown: Option<String>,
     /// How directions weighed when it was baked.
     pub weight: Weight,
     /// Where its rays went; none means the hemisphere if the stream has normals, else the sphere.
@@ -88,6 +90,7 @@ impl RelightOptions {
             rotation_degrees: 0.0,
             exposure_stops: 0.0,
             attribute: None,
+            shown: None,
             weight: Weight::Uniform,
             domain: None,
             light_bands: sunny.then_some(BANDS_MAX as u32),
@@ -155,7 +158,7 @@ pub fn relight(
         exposure_stops: options.exposure_stops,
         stats: RelightStats {
             drawn,
-            attribute: schema.attributes[shading.column].name.clone(),
+            attribute: schema.attributes[shading.column()].name.clone(),
             repaired_pixels: options.environment.repaired_pixels(),
         },
     })
@@ -169,6 +172,9 @@ fn shading(schema: &Schema, options: &RelightOptions) -> Result<Shading> {
             options.exposure_stops, options.rotation_degrees
         ))
         .hint("exposure goes from -100 to 100, the rotation is any finite number"));
+    }
+    if let Some(name) = &options.shown {
+        return find_shown(schema, name).map(Shading::Shown);
     }
     let column = find_attribute(schema, options.attribute.as_deref())?;
     let components = usize::from(schema.attributes[column].components);
@@ -188,7 +194,20 @@ fn shading(schema: &Schema, options: &RelightOptions) -> Result<Shading> {
         transfer::Transfer::new(&light, light_bands, visibility_bands, cosine_bands, options.weight);
     let normals = schema.find(names::NORMAL).is_some();
     let domain = options.domain.unwrap_or(if normals { Domain::Hemisphere } else { Domain::Sphere });
-    Ok(Shading { transfer, column, domain })
+    Ok(Shading::Lit(Lit { transfer, column, domain }))
+}
+
+/// The column of the attribute called `name`.
+fn find_shown(schema: &Schema, name: &str) -> Result<usize> {
+    schema.find(name).ok_or_else(|| {
+        let names = || schema.attributes.iter().map(|attribute| attribute.name.as_str());
+        let hint = match nearest(name, names()) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None => format!("it has {}", names().collect::<Vec<_>>().join(", ")),
+        };
+        let message = format!("the stream has no attribute `{}`", name.escape_debug());
+        Error::new(ErrorKind::NotFound, message).hint(hint)
+    })
 }
 
 /// The column of visibility coefficients: the one that is asked for, else the first that is named after occlusion.
@@ -238,7 +257,12 @@ pub fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
     }
     ["sh_occlusion", "occlusion"]
         .into_iter()
-        .find_map(|word| candidates.iter().copied().find(|&column| name(column).contains(word)))
+        .find_map(|word| {
+            // Ambient occlusion is one number, not one coefficient
+            let is_named =
+                |column: &usize| name(*column).contains(word) && !name(*column).contains("ambient");
+            candidates.iter().copied().find(is_named)
+        })
         .ok_or_else(|| Error::new(ErrorKind::NotFound, "no attribute is named `sh_occlusion`").hint(listed()))
 }
 

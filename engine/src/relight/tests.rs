@@ -340,3 +340,16 @@ fn broken_coefficients_stay_where_they_are() {
         assert!(picture.rgb.iter().all(|v| v.is_finite() && *v >= 0.0), "{value}");
     }
 }
+
+/// Catches values that are lit, scaled or taken from another column when they are to be drawn as they are.
+#[test]
+fn values_are_shown_as_they_are() {
+    let mut options = options(DVec3::ZERO);
+    options.shown = Some(names::ALBEDO.into());
+    let picture = draw(vec![quad(DVec3::new(0.0, 0.0, -2.0), 1.0, 51.0)], &options);
+    let middle = 3 * (16 * 32 + 16);
+    assert!(picture.rgb[middle..middle + 3].iter().all(|value| (value - 0.2).abs() < 1e-6));
+    options.shown = Some("albedoo".into());
+    let error = relight(&mut stream(vec![]), &options, &mut |_| {}).expect_err("a slip");
+    assert!(error.hint_text().is_some_and(|hint| hint.contains("`albedo`")), "{error}");
+}

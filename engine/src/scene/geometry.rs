@@ -6,9 +6,10 @@ use std::path::Path;
 use super::element::{Element, Value};
 use super::files::Files;
 use super::names::Names;
+use super::output::asked_for;
 use super::parse::limited;
 use super::{
-    BakeAttribute, BakeSet, Dice, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result,
+    BakeAttribute, BakeSet, Dice, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result, Shader,
     StreamSource,
 };
 use crate::stream::schema::ATTRIBUTES_MAX;
@@ -35,8 +36,10 @@ pub(super) struct Geometries<'a, 'd> {
     pub files: Files<'a>,
     /// Declared cameras.
     pub cameras: &'a Names<'d>,
-    /// Declared shaders.
+    /// Names of the declared shaders.
     pub shaders: &'a Names<'d>,
+    /// The shaders.
+    pub declared: &'a [Shader],
     /// Declared geometries.
     pub geometries: Names<'d>,
     /// The geometries that occlude.
@@ -53,12 +56,13 @@ impl<'a, 'd> Geometries<'a, 'd> {
         elements: &[Element<'d>],
         files: Files<'a>,
         cameras: &'a Names<'d>,
-        shaders: &'a Names<'d>,
+        (shaders, declared): (&'a Names<'d>, &'a [Shader]),
     ) -> Result<Self> {
-        let mut declared = Self {
+        let mut this = Self {
             files,
             cameras,
             shaders,
+            declared,
             geometries: Names::new("geometry"),
             occluders: BTreeSet::new(),
             bake_sets: Names::of_files("bake set"),
@@ -70,12 +74,12 @@ impl<'a, 'd> Geometries<'a, 'd> {
             limited(*element, count, GEOMETRIES_MAX, "geometries")?;
             let children = ["stream", "instance", "instances", "displacement", "bakeset"];
             element.expect_only(&["name", "occluder"], &children)?;
-            let name = declared.geometries.declare(&element.required("name")?)?;
+            let name = this.geometries.declare(&element.required("name")?)?;
             if is_occluder(*element)? {
-                declared.occluders.insert(name);
+                this.occluders.insert(name);
             }
         }
-        Ok(declared)
+        Ok(this)
     }
 
     /// `<geometry name="" occluder="">` with streams, instances and bake sets.
@@ -210,10 +214,11 @@ impl<'a, 'd> Geometries<'a, 'd> {
         let mut names = Names::new("attribute");
         for child in element.children_named("attribute") {
             limited(child, attributes.len(), ATTRIBUTES_MAX, "attributes in a bake set")?;
-            child.expect_only(&["name", "shader"], &[])?;
+            child.expect_only(&["name", "shader", "output"], &[])?;
             let name = names.declare_attribute(&child.required("name")?)?;
-            attributes
-                .push(BakeAttribute { name, shader: self.shaders.resolve(&child.required("shader")?)? });
+            let shader = self.shaders.resolve(&child.required("shader")?)?;
+            let output = asked_for(child, self.declared, &shader)?;
+            attributes.push(BakeAttribute { name, shader, output });
         }
         if attributes.is_empty() {
             let message =

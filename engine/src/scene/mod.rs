@@ -11,6 +11,7 @@ mod geometry;
 pub mod instances;
 mod matrix;
 mod names;
+mod output;
 mod parse;
 mod shader;
 #[cfg(test)]
@@ -26,6 +27,7 @@ use glam::DMat4;
 pub use self::dice::Dice;
 pub use self::files::Roots;
 pub use self::instances::{InstanceReader, for_each_instance};
+pub use self::output::Output;
 pub use self::parse::UNITS;
 pub use self::xml::{DEPTH_MAX, ELEMENTS_MAX, SCENE_BYTES_MAX, VALUE_BYTES_MAX};
 pub use crate::stream::schema::UpAxis;
@@ -165,6 +167,15 @@ pub struct ShOcclusion {
     pub storage: crate::stream::ValueType,
 }
 
+impl ShOcclusion {
+    /// The output of all coefficients.
+    pub const COEFFICIENTS: &str = "coefficients";
+    /// The output of the share of the hemisphere, weighted with the cosine, that is open: 1 number.
+    pub const AMBIENT_OCCLUSION: &str = "ambient_occlusion";
+    /// The output of the mean open direction: a unit vector.
+    pub const BENT_NORMAL: &str = "bent_normal";
+}
+
 impl Default for ShOcclusion {
     fn default() -> Self {
         Self {
@@ -269,4 +280,6 @@ pub struct BakeAttribute {
     pub name: String,
     /// The shader that computes it.
     pub shader: String,
+    /// Which of the shader's [outputs](ShaderKind::outputs).
+    pub output: String,
 }

@@ -47,7 +47,7 @@ pub(super) fn scene(document: &Document<'_>, frame: Option<i64>, roots: Option<&
     let elements = section(root, "geometries", "geometry")?;
     let base = document.path.parent().unwrap_or("".as_ref());
     let files = Files { base, frame, roots };
-    let mut declared = Geometries::declare(&elements, files, &camera_names, &shader_names)?;
+    let mut declared = Geometries::declare(&elements, files, &camera_names, (&shader_names, &shaders))?;
     if declared.occluders.is_empty() {
         let message = "scene has no occluder, expected a geometry with `occluder=\"true\"`";
         return Err(root.error(ErrorKind::Invalid, message));

@@ -114,6 +114,14 @@ impl Sampler {
         Rotation { hash, cos: cos as f32, sin: sin as f32 }
     }
 
+    /// The mean of the cosines between the normal of point `index` and its directions, uniform over the hemisphere: one half but
+    /// for the shift along the normal.
+    pub fn mean_cosine(&self, index: u64) -> f32 {
+        let shift = f64::from(unit_f32(self.rotation(index).hash));
+        let samples = f64::from(self.samples);
+        (1.0 - (0.5 * (samples - 1.0) + shift) / samples) as f32
+    }
+
     /// Cosine and sine of every sample's angle, before a point's rotation.
     pub fn turns(&self) -> &[[f32; 2]] {
         &self.turns

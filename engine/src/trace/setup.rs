@@ -40,8 +40,13 @@ impl Shading {
         Self { shader: shader.clone(), sampler, shift }
     }
 
-    /// The unit normal and the spread of directions of a point.
-    pub(super) fn spread(&self, normal: Vec3) -> (Vec3, Spread) {
+    /// What makes the rays.
+    pub fn sampler(&self) -> &Sampler {
+        &self.sampler
+    }
+
+    /// The unit normal and the spread of directions of a point; the z axis where it has no normal.
+    pub fn spread(&self, normal: Vec3) -> (Vec3, Spread) {
         let unit = normal.as_dvec3().normalize_or_zero().as_vec3();
         let has_normal = unit != Vec3::ZERO;
         (if has_normal { unit } else { Vec3::Z }, Spread::new(&self.shader, has_normal))

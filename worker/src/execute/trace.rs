@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use engine::bake::set::BatchTracer;
+use engine::bake::tracer::BatchTracer;
 use engine::bake::work::BakeWork;
 use engine::batch::BatchPlan;
 use engine::output::Part;

@@ -30,7 +30,7 @@ const SCENE: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
       <instance matrix="2,0,0,0, 0,2,0,0, 0,0,2,0, 5,6,7,1"/>
       <bakeset name="trees" occluders="trees ground">
         <attribute name="sh" shader="occlusion"/>
-        <attribute name="shadow" shader="plain"/>
+        <attribute name="shadow" shader="plain"/> <attribute name="ao" shader="occlusion" output="ambient_occlusion"/>
       </bakeset>
     </geometry>
     <geometry name="ground" occluder="true">
@@ -62,7 +62,11 @@ fn a_whole_scene_is_read() {
     };
     let shader =
         |name: &str, parameters| Shader { name: name.into(), kind: ShaderKind::ShOcclusion(parameters) };
-    let attribute = |name: &str, shader: &str| BakeAttribute { name: name.into(), shader: shader.into() };
+    let attribute = |name: &str, shader: &str, output: &str| BakeAttribute {
+        name: name.into(),
+        shader: shader.into(),
+        output: output.into(),
+    };
     let procedural =
         |kind, seed, micropolygons| vec![StreamSource::Procedural(Procedural { kind, seed, micropolygons })];
     let expected = Scene {
@@ -88,7 +92,11 @@ fn a_whole_scene_is_read() {
                 bake_sets: vec![BakeSet {
                     name: "trees".into(),
                     occluders: vec!["trees".into(), "ground".into()],
-                    attributes: vec![attribute("sh", "occlusion"), attribute("shadow", "plain")],
+                    attributes: vec![
+                        attribute("sh", "occlusion", "coefficients"),
+                        attribute("shadow", "plain", "coefficients"),
+                        attribute("ao", "occlusion", "ambient_occlusion"),
+                    ],
                 }],
             },
             Geometry {
@@ -106,7 +114,7 @@ fn a_whole_scene_is_read() {
                 bake_sets: vec![BakeSet {
                     name: "probes".into(),
                     occluders: vec![],
-                    attributes: vec![attribute("sh", "plain")],
+                    attributes: vec![attribute("sh", "plain", "coefficients")],
                 }],
             },
         ],

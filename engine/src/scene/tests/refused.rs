@@ -162,6 +162,7 @@ shader="occlusion" | shader="«oclusion" | unknown shader `oclusion`, expected o
 "trees ground" | "trees «grund" | unknown occluder `grund`, expected one of `ground`, `trees` | did you mean `ground`?
 "trees ground" | "trees⏎ «probes" | geometry `probes` is no occluder | add `occluder="true"` to it, at line 26, column 21
 "trees ground" | "trees ground «trees" | occluder `trees` is there twice |
+output="ambient_occlusion" | output="«ambient_oclusion" | unknown output `ambient_oclusion`, expected one of `coefficients`,  | did you mean `ambient_occlusion`?
 "trees ground" | "« " | list of occluders is empty | a bake set without `occluders` sees all
 "#,
     );
