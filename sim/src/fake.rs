@@ -249,7 +249,10 @@ impl Fake {
                 (keys::index(&keys::brick_map(task.map.as_deref().unwrap_or(&map))), built)
             }
             PassKind::Plan => (keys::index(&folder), PassResult::Plan { batches: load.batches, points }),
-            _ => (format!("{folder}/{SET}.mgs"), PassResult::Merge { points, baked: points, bytes }),
+            _ => (
+                format!("{folder}/{SET}.mgs"),
+                PassResult::Merge { points, baked: points, bytes, preview: false, picture: false },
+            ),
         };
         if self.put(session, claim, &key, &content).is_err() {
             return;

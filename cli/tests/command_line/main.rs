@@ -157,8 +157,8 @@ fn shaders_have_outputs() {
     let baked = desk.at("out/ground.mgs");
     let summary = json(["inspect", &baked]);
     let of = |name: &str| {
-        let attributes = summary["attributes"].as_array().expect("attributes").iter();
-        attributes.cloned().find(|attribute| attribute["name"] == name).expect(name)
+        let mut attributes = summary["attributes"].as_array().expect("attributes").iter();
+        attributes.find(|attribute| attribute["name"] == name).cloned().expect(name)
     };
     // Over the hemisphere band 1 points to what is open, and points that were not baked are zero
     assert_eq!((&of("ambient")["components"], &of("bent_normal")["components"]), (&1.into(), &3.into()));
