@@ -30,10 +30,10 @@ impl<Outer: MatrixSource, Inner: MatrixSource> MatrixSource for Product<Outer, I
 
     fn next(&mut self) -> Result<Option<DMat4>> {
         loop {
-            if let Some(world_from_outer) = self.world_from_outer {
-                if let Some(outer_from_inner) = self.inner.next()? {
-                    return Ok(Some(world_from_outer * outer_from_inner));
-                }
+            if let Some(world_from_outer) = self.world_from_outer
+                && let Some(outer_from_inner) = self.inner.next()?
+            {
+                return Ok(Some(world_from_outer * outer_from_inner));
             }
             self.world_from_outer = self.outer.next()?;
             if self.world_from_outer.is_none() {

@@ -278,7 +278,8 @@ fn decode_header(path: &Path, fixed: &[u8; FIXED_BYTES]) -> Result<Header> {
     };
     if u32_at(fixed, 76) as usize != header.record_bytes()
         || !header.corner.is_finite()
-        || !(header.edge > 0.0)
+        || header.edge.is_nan()
+        || header.edge <= 0.0
     {
         return Err(Error::corrupt(path, 76, "the record's length or the cube is impossible"));
     }
