@@ -43,6 +43,7 @@ struct Arguments {
     batches: usize,
     rays: u32,
     errors: bool,
+    maps: Option<PathBuf>,
 }
 
 impl Arguments {
@@ -56,6 +57,7 @@ impl Arguments {
             batches: 3,
             rays: 512,
             errors: false,
+            maps: None,
         };
         let mut words = std::env::args().skip(1);
         while let Some(word) = words.next() {
@@ -68,6 +70,7 @@ impl Arguments {
                 "--repeats" => read.repeats = value().parse().expect("a number"),
                 "--batches" => read.batches = value().parse().expect("a number"),
                 "--rays" => read.rays = value().parse().expect("a number"),
+                "--maps" => read.maps = Some(value().into()),
                 "--errors" => read.errors = true,
                 "--bench" => {}
                 _ => panic!("`{word}` is no option"),
@@ -110,7 +113,10 @@ struct Bench {
 fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let batches = batches(stream, arguments.batches);
-    let map = build_map(stream, folder.path());
+    let map = match &arguments.maps {
+        Some(maps) => build_map(stream, &maps.join(name)),
+        None => build_map(stream, folder.path()),
+    };
     let (triangles, embree) = embree(stream, &arguments.library);
     let shader = ShOcclusion { samples: arguments.rays, ..ShOcclusion::default() };
     let bench = Bench { map, batches, shader, threads: arguments.threads };
@@ -262,8 +268,11 @@ fn build_map(stream: &mut dyn MicrogridStream, folder: &std::path::Path) -> Arc<
         scratch: folder.join("scratch"),
         far_field: FarField::Paper,
     };
-    std::fs::create_dir_all(&options.scratch).expect("a folder can be made");
     let target = folder.join("map");
+    if target.exists() {
+        return Arc::new(BrickMap::open(&target).expect("the map opens"));
+    }
+    std::fs::create_dir_all(&options.scratch).expect("a folder can be made");
     let mut streams = [OccluderStream { stream }];
     build(&mut streams, &options, &target, &|_, _| {}, &AtomicBool::new(false)).expect("the map builds");
     Arc::new(BrickMap::open(&target).expect("the map opens"))

@@ -9,28 +9,39 @@ use glam::{DVec3, IVec3, Vec3};
 use super::instance::{self, Instance};
 
 /// Rays of a bundle at most.
-pub const RAYS_MAX: usize = 8192;
+pub const RAYS_MAX: usize = 16384;
 /// Points of a bundle at most.
-pub const POINTS_MAX: usize = 16;
+pub const POINTS_MAX: usize = 32;
 
-/// What a box test reads of a ray.
+/// What a box test reads of a ray. Rays are looked up by number all the time: the smaller, the more of them are near.
 #[derive(Clone, Copy, Debug, Default)]
-#[repr(C, align(32))]
+#[repr(C, align(16))]
 pub struct BoxRay {
     /// Reciprocal direction.
-    pub inverse: [f32; 4],
-    /// Origin times reciprocal direction.
-    pub offset: [f32; 4],
+    pub inverse: [f32; 3],
+    /// Number of the origin.
+    pub origin: u32,
 }
 
 impl BoxRay {
-    /// The ray from `origin`, relative to the bundle's reference.
+    /// The ray along `direction` from the origin of the given number.
     #[inline(always)]
-    fn new(origin: Vec3, direction: Vec3) -> Self {
+    fn new(origin: usize, direction: Vec3) -> Self {
         // A component of zero would make 0 * infinity; a tiny one is as good
-        let [x, y, z] =
+        let inverse =
             direction.to_array().map(|d| 1.0 / if d.abs() < 1e-18 { 1e-18_f32.copysign(d) } else { d });
-        Self { inverse: [x, y, z, 0.0], offset: [origin.x * x, origin.y * y, origin.z * z, 0.0] }
+        Self { inverse, origin: origin as u32 }
+    }
+}
+
+/// A bundle's origins relative to its reference, per axis: the other thing that a box test reads.
+pub type BoxOrigins = [[f32; POINTS_MAX]; 3];
+
+/// Notes origin `number`, which lies at `relative` from the reference.
+#[inline(always)]
+fn place_origin(origins: &mut BoxOrigins, number: usize, relative: Vec3) {
+    for (origins, coordinate) in origins.iter_mut().zip(relative.to_array()) {
+        origins[number] = coordinate;
     }
 }
 
@@ -58,6 +69,8 @@ pub struct Bundle {
     pub bounds: [Vec3; 2],
     /// For box tests.
     pub box_rays: Vec<BoxRay>,
+    /// Likewise.
+    pub box_origins: BoxOrigins,
     /// Directions; the fourth component is 0. Unit vectors, but not inside an instance.
     pub directions: Vec<[f32; 4]>,
     /// Extinction met so far.
@@ -65,7 +78,7 @@ pub struct Bundle {
     /// A ray ends when its extinction passes this.
     pub limit: Vec<u32>,
     /// Bit i: ray i has not ended.
-    pub alive: [u16; RAYS_MAX / 16],
+    pub alive: [u32; RAYS_MAX / 32],
     /// Rays end after this many times their direction; infinite if nothing limits them.
     pub reach: f32,
     /// Hits nearer than this many times the direction are tested again in double precision.
@@ -81,6 +94,7 @@ pub struct Inside {
     origins: Vec<Origin>,
     bounds: [Vec3; 2],
     box_rays: Vec<BoxRay>,
+    box_origins: BoxOrigins,
     directions: Vec<[f32; 4]>,
     reach: f32,
     near: f32,
@@ -98,10 +112,11 @@ impl Bundle {
             origins: Vec::with_capacity(POINTS_MAX),
             bounds: [Vec3::ZERO; 2],
             box_rays: Vec::with_capacity(RAYS_MAX),
+            box_origins: [[0.0; POINTS_MAX]; 3],
             directions: Vec::with_capacity(RAYS_MAX),
             extinction: Vec::with_capacity(RAYS_MAX),
             limit: Vec::with_capacity(RAYS_MAX),
-            alive: [0; RAYS_MAX / 16],
+            alive: [0; RAYS_MAX / 32],
             reach: f32::INFINITY,
             near: 0.0,
             stretch: 1.0,
@@ -115,7 +130,7 @@ impl Bundle {
         self.directions.clear();
         self.extinction.clear();
         self.limit.clear();
-        self.alive = [0; RAYS_MAX / 16];
+        self.alive = [0; RAYS_MAX / 32];
         (self.reach, self.near) = (reach, near);
     }
 
@@ -142,6 +157,7 @@ impl Bundle {
         }
         let relative = (position - self.reference).as_vec3();
         self.bounds = [self.bounds[0].min(relative), self.bounds[1].max(relative)];
+        place_origin(&mut self.box_origins, self.origins.len(), relative);
         let first = self.len() as u16;
         self.origins.push(Origin { position, exact, first, end: first });
     }
@@ -151,13 +167,13 @@ impl Bundle {
     pub fn push_ray(&mut self, direction: Vec3, limit: u32) {
         let ray = self.len();
         debug_assert!(ray < RAYS_MAX);
+        let number = self.origins.len().wrapping_sub(1);
         let Some(origin) = self.origins.last_mut() else { return };
-        let relative = (origin.position - self.reference).as_vec3();
-        self.box_rays.push(BoxRay::new(relative, direction));
+        self.box_rays.push(BoxRay::new(number, direction));
         self.directions.push([direction.x, direction.y, direction.z, 0.0]);
         self.extinction.push(0);
         self.limit.push(limit);
-        self.alive[ray / 16] |= 1 << (ray % 16);
+        self.alive[ray / 32] |= 1 << (ray % 32);
         origin.end = ray as u16 + 1;
     }
 
@@ -171,10 +187,11 @@ impl Bundle {
     }
 
     /// Adds extinction to a ray and ends it if that passes its limit. Whether it lives on.
+    #[inline(always)]
     pub fn extinguish(&mut self, ray: u16, extinction: u32) -> bool {
         let ends = self.add(ray, extinction);
         if ends {
-            self.alive[usize::from(ray) / 16] &= !(1 << (ray % 16));
+            self.alive[usize::from(ray) / 32] &= !(1 << (ray % 32));
         }
         !ends
     }
@@ -182,7 +199,7 @@ impl Bundle {
     /// Whether a ray has not ended.
     #[inline(always)]
     pub fn is_alive(&self, ray: u16) -> bool {
-        self.alive[usize::from(ray) / 16] >> (ray % 16) & 1 != 0
+        self.alive[usize::from(ray) / 32] >> (ray % 32) & 1 != 0
     }
 }
 
@@ -194,6 +211,7 @@ impl Inside {
             origins: Vec::with_capacity(POINTS_MAX),
             bounds: [Vec3::ZERO; 2],
             box_rays: vec![BoxRay::default(); RAYS_MAX],
+            box_origins: [[0.0; POINTS_MAX]; 3],
             directions: vec![[0.0; 4]; RAYS_MAX],
             reach: f32::INFINITY,
             near: 0.0,
@@ -219,12 +237,14 @@ impl Inside {
             }
             let relative = position.wrapping_sub(self.reference).as_vec3();
             self.bounds = [self.bounds[0].min(relative), self.bounds[1].max(relative)];
+            let number = self.origins.len();
+            place_origin(&mut self.box_origins, number, relative);
             self.origins.push(Origin { position, exact, ..*origin });
             while at < rays.len() && rays[at] < origin.end {
                 let ray = usize::from(rays[at]);
                 let [dx, dy, dz, _] = bundle.directions[ray];
                 let direction = (x * dx + y * dy) + z * dz;
-                self.box_rays[ray] = BoxRay::new(relative, direction);
+                self.box_rays[ray] = BoxRay::new(number, direction);
                 self.directions[ray] = [direction.x, direction.y, direction.z, 0.0];
                 at += 1;
             }
@@ -243,6 +263,7 @@ impl Inside {
         std::mem::swap(&mut self.origins, &mut bundle.origins);
         std::mem::swap(&mut self.bounds, &mut bundle.bounds);
         std::mem::swap(&mut self.box_rays, &mut bundle.box_rays);
+        std::mem::swap(&mut self.box_origins, &mut bundle.box_origins);
         std::mem::swap(&mut self.directions, &mut bundle.directions);
         std::mem::swap(&mut self.reach, &mut bundle.reach);
         std::mem::swap(&mut self.near, &mut bundle.near);

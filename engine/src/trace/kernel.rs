@@ -182,7 +182,7 @@ impl<B: Bricks> State<'_, B> {
         // SAFETY: the plain loops need no instruction set; there is one ray, of number 0
         let met = unsafe {
             Plain::boxes(self.node(address), bundle.reference, &bundle.bounds, &mut boxes);
-            Plain::meet_boxes(&boxes, &[self.box_ray], &[0], &mut masks)
+            Plain::meet_boxes(&boxes, &[self.box_ray], &bundle.box_origins, &[0], &mut masks)
         };
         (boxes, met)
     }

@@ -15,7 +15,7 @@ use crate::scene::ShOcclusion;
 use crate::shade::sample::{Sampler, Spread};
 
 /// Points of a bundle, unless their rays are too many or they lie too far apart.
-const BUNDLE_POINTS: usize = 16;
+const BUNDLE_POINTS: usize = 32;
 const _: () = assert!(BUNDLE_POINTS <= POINTS_MAX);
 
 /// Hits nearer than this are tested again in double precision (paper, section 5).
@@ -167,7 +167,7 @@ fn pieces(origins: &[IVec3], bounds: &LatticeBox, samples: u32) -> Vec<Piece> {
     // On a surface, neighbours are about this far apart
     let diagonal = (bounds.max - bounds.min).as_dvec3().length();
     let spacing = diagonal / (origins.len() as f64).sqrt();
-    let near2 = (4.0 * spacing) * (4.0 * spacing);
+    let near2 = (6.0 * spacing) * (6.0 * spacing);
     let points_max = BUNDLE_POINTS.min(RAYS_MAX / samples as usize);
     let mut start = 0;
     for point in 1..=origins.len() {

@@ -1,6 +1,6 @@
 //! The inner loops for AVX-512: 32 ray numbers, 16 triangles or 8 boxes at a time.
 //!
-//! Box tests use 256-bit vectors: a ray against eight boxes fills them exactly. There are no closures here: one is a
+//! There are no closures here: one is a
 //! function of its own, compiled without the instruction set, and every intrinsic in it would become a call.
 
 use std::arch::x86_64::*;
@@ -9,7 +9,7 @@ use glam::{IVec3, Vec3};
 
 use super::plain::Plain;
 use super::{BOX_ERROR, Boxes, Corners, Lanes, Look, Planes, SLACK};
-use crate::brick::bundle::{BoxRay, RAYS_MAX};
+use crate::brick::bundle::{BoxOrigins, BoxRay, POINTS_MAX};
 use crate::brick::leaf::{HEADER_BYTES, Kind, Layout};
 use crate::brick::node::{LOCATION_BITS, Node, WIDTH};
 
@@ -17,35 +17,34 @@ use crate::brick::node::{LOCATION_BITS, Node, WIDTH};
 #[derive(Clone, Copy, Debug)]
 pub struct Avx512;
 
+/// Up to this many rays are tested one by one.
+const SINGLE_MAX: usize = 6;
+
+const _: () = assert!(SINGLE_MAX <= 8);
+const _: () = assert!(POINTS_MAX == 32, "two vectors of origins");
+
 /// Coordinates of more bits do not fit a 32-bit lane at every bit offset.
 const LANE_BITS_MAX: u8 = 25;
 
 impl Lanes for Avx512 {
     #[inline(always)]
-    unsafe fn filter(alive: &[u16], ids: &[u16], out: &mut [u16]) -> usize {
+    unsafe fn filter(alive: &[u32], ids: &[u16], out: &mut [u16]) -> usize {
         debug_assert!(out.len() >= ids.len() + SLACK);
-        // SAFETY: loads are masked to `ids`; stores of 32 numbers stay within the slack; `alive` is read in chunks
+        // SAFETY: loads are masked to `ids`; stores of 16 numbers stay within the slack; words of rays that exist are looked up
         unsafe {
-            let (fifteen, one) = (_mm512_set1_epi16(15), _mm512_set1_epi16(1));
             let mut count = 0;
-            for chunk in ids.chunks(32) {
-                let present = u32::MAX >> (32 - chunk.len());
-                let ids = _mm512_maskz_loadu_epi16(present, chunk.as_ptr().cast());
-                let word = _mm512_srli_epi16::<4>(ids);
-                // 64 words at a time: look them up for all rays, and keep those of the rays they belong to
-                let block = _mm512_srli_epi16::<6>(word);
-                let mut bits = _mm512_setzero_si512();
-                for (i, words) in alive.chunks_exact(64).enumerate() {
-                    let lower = _mm512_loadu_si512(words.as_ptr().cast());
-                    let upper = _mm512_loadu_si512(words.as_ptr().add(32).cast());
-                    let these = _mm512_permutex2var_epi16(lower, word, upper);
-                    let here = _mm512_cmpeq_epi16_mask(block, _mm512_set1_epi16(i as i16));
-                    bits = _mm512_mask_mov_epi16(bits, here, these);
-                }
-                let bit = _mm512_srlv_epi16(bits, _mm512_and_si512(ids, fifteen));
-                let keep = _mm512_mask_test_epi16_mask(present, bit, one);
-                let kept = _mm512_maskz_compress_epi16(keep, ids);
-                _mm512_storeu_si512(out.as_mut_ptr().add(count).cast(), kept);
+            for chunk in ids.chunks(16) {
+                let present = u16::MAX >> (16 - chunk.len());
+                let ids = _mm256_maskz_loadu_epi16(present, chunk.as_ptr().cast());
+                let ray = _mm512_cvtepu16_epi32(ids);
+                let word = _mm512_srli_epi32::<5>(ray);
+                let words = _mm512_i32gather_epi32::<4>(word, alive.as_ptr().cast());
+                let bit = _mm512_rolv_epi32(_mm512_set1_epi32(1), ray);
+                let keep = _mm512_mask_test_epi32_mask(present, words, bit);
+                _mm256_storeu_si256(
+                    out.as_mut_ptr().add(count).cast(),
+                    _mm256_maskz_compress_epi16(keep, ids),
+                );
                 count += keep.count_ones() as usize;
             }
             count
@@ -119,43 +118,29 @@ impl Lanes for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn end(alive: &mut [u16; RAYS_MAX / 16], ray: u16) {
-        // SAFETY: the block of 32 words that the ray's bit is in is within the array
-        unsafe {
-            // The whole block is written, so that the next filter's load can be served from the store
-            let block = alive.as_mut_ptr().add(usize::from(ray) / 512 * 32);
-            let words = _mm512_loadu_si512(block.cast());
-            let word = _mm512_maskz_set1_epi16(1 << (ray / 16 % 32), (1_u16 << (ray % 16)) as i16);
-            _mm512_storeu_si512(block.cast(), _mm512_andnot_si512(word, words));
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8 {
+    unsafe fn meet_boxes(
+        boxes: &Boxes,
+        rays: &[BoxRay],
+        origins: &BoxOrigins,
+        ids: &[u16],
+        masks: &mut [u8],
+    ) -> u8 {
         debug_assert!(masks.len() >= ids.len() + SLACK);
-        // SAFETY: ids are below the number of rays; there is a mask for each, and the slack
+        // SAFETY: loads of ids are masked; `masks` has the slack; ids are rays, the first one in lanes without a ray
         unsafe {
-            let mut center = [_mm256_setzero_ps(); 3];
-            let mut half = [_mm256_setzero_ps(); 3];
-            for axis in 0..3 {
-                center[axis] = _mm256_loadu_ps(boxes.center[axis].as_ptr());
-                half[axis] = _mm256_loadu_ps(boxes.half[axis].as_ptr());
-            }
-            let mut any = 0;
-            for (i, ids) in ids.chunks(32).enumerate() {
+            let mut any = _mm_setzero_si128();
+            for (i, ids) in ids.chunks(16).enumerate() {
+                let met = if ids.len() > SINGLE_MAX {
+                    meet_boxes_16(boxes, rays, origins, ids)
+                } else {
+                    meet_boxes_singly(boxes, rays, origins, ids)
+                };
                 // Masks go out in one piece, so that the selections' loads can be served from the store
-                let mut words = [0_u64; 4];
-                for (word, ids) in words.iter_mut().zip(ids.chunks(8)) {
-                    for (i, &id) in ids.iter().enumerate() {
-                        let met = meet_box(rays.get_unchecked(usize::from(id)), &center, &half);
-                        *word |= u64::from(met) << (8 * i);
-                    }
-                    any |= *word;
-                }
-                let [a, b, c, d] = words;
-                let packed = _mm256_set_epi64x(d as i64, c as i64, b as i64, a as i64);
-                _mm256_storeu_si256(masks.as_mut_ptr().add(32 * i).cast(), packed);
+                _mm_storeu_si128(masks.as_mut_ptr().add(16 * i).cast(), met);
+                any = _mm_or_si128(any, met);
             }
+            let any = _mm_or_si128(any, _mm_srli_si128::<8>(any));
+            let any = _mm_cvtsi128_si64(any) as u64;
             let any = any | any >> 32;
             let any = any | any >> 16;
             (any | any >> 8) as u8
@@ -293,23 +278,104 @@ impl Lanes for Avx512 {
     }
 }
 
-/// The boxes that a ray meets.
+/// The boxes that each of a few rays meets, a byte a ray: one ray against all boxes at a time.
 #[inline(always)]
-unsafe fn meet_box(ray: &BoxRay, center: &[__m256; 3], half: &[__m256; 3]) -> u8 {
-    // SAFETY: components of the ray are read
+unsafe fn meet_boxes_singly(boxes: &Boxes, rays: &[BoxRay], origins: &BoxOrigins, ids: &[u16]) -> __m128i {
+    // SAFETY: arrays of 8; ids are rays, whose origins are below `POINTS_MAX`
     unsafe {
-        let mut enter = _mm256_setzero_ps();
-        let mut leave = _mm256_set1_ps(f32::MAX);
-        for axis in 0..3 {
-            let inverse = _mm256_broadcast_ss(&ray.inverse[axis]);
-            let offset = _mm256_broadcast_ss(&ray.offset[axis]);
-            let middle = _mm256_fmsub_ps(center[axis], inverse, offset);
-            let steep = absolute(inverse);
-            enter = _mm256_max_ps(_mm256_fnmadd_ps(half[axis], steep, middle), enter);
-            leave = _mm256_min_ps(_mm256_fmadd_ps(half[axis], steep, middle), leave);
+        let mut masks = 0_u64;
+        for (i, &id) in ids.iter().enumerate() {
+            let ray = rays.get_unchecked(usize::from(id));
+            let mut enter = _mm256_setzero_ps();
+            let mut leave = _mm256_set1_ps(f32::MAX);
+            for axis in 0..3 {
+                let inverse = _mm256_set1_ps(ray.inverse[axis]);
+                let origin = *origins[axis].get_unchecked(ray.origin as usize);
+                let offset = _mm256_mul_ps(_mm256_set1_ps(origin), inverse);
+                let middle = _mm256_fmsub_ps(_mm256_loadu_ps(boxes.center[axis].as_ptr()), inverse, offset);
+                let (half, steep) = (_mm256_loadu_ps(boxes.half[axis].as_ptr()), absolute(inverse));
+                enter = _mm256_max_ps(_mm256_fnmadd_ps(half, steep, middle), enter);
+                leave = _mm256_min_ps(_mm256_fmadd_ps(half, steep, middle), leave);
+            }
+            let met = _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave);
+            masks |= u64::from(met) << (8 * i);
         }
-        _mm256_cmp_ps_mask::<_CMP_LE_OQ>(enter, leave)
+        _mm_cvtsi64_si128(masks as i64)
     }
+}
+
+/// The boxes that each of up to 16 rays meets, a byte a ray: one box against all rays at a time.
+#[inline(always)]
+unsafe fn meet_boxes_16(boxes: &Boxes, rays: &[BoxRay], origins: &BoxOrigins, ids: &[u16]) -> __m128i {
+    // SAFETY: loads of ids are masked; ids are rays, the first one in lanes without a ray; their origins are below
+    // `POINTS_MAX`
+    unsafe {
+        let present = u16::MAX >> (16 - ids.len());
+        let mut of_lane = [0_u16; 16];
+        let ids = _mm256_maskz_loadu_epi16(present, ids.as_ptr().cast());
+        _mm256_storeu_si256(of_lane.as_mut_ptr().cast(), ids);
+        let [x, y, z, origin] = transpose(&of_lane, rays);
+        let origin = _mm512_castps_si512(origin);
+        let inverse = [x, y, z];
+        let (mut offset, mut steep) = (inverse, inverse);
+        for axis in 0..3 {
+            let first = _mm512_loadu_ps(origins[axis].as_ptr());
+            let last = _mm512_loadu_ps(origins[axis].as_ptr().add(POINTS_MAX - 16));
+            let coordinate = _mm512_permutex2var_ps(first, origin, last);
+            offset[axis] = _mm512_mul_ps(coordinate, inverse[axis]);
+            steep[axis] = _mm512_andnot_ps(_mm512_set1_ps(-0.0), inverse[axis]);
+        }
+
+        // One box against all rays at a time
+        let mut met = _mm_setzero_si128();
+        for slot in 0..WIDTH {
+            let mut enter = _mm512_setzero_ps();
+            let mut leave = _mm512_set1_ps(f32::MAX);
+            for axis in 0..3 {
+                let center = _mm512_set1_ps(boxes.center[axis][slot]);
+                let half = _mm512_set1_ps(boxes.half[axis][slot]);
+                let middle = _mm512_fmsub_ps(center, inverse[axis], offset[axis]);
+                enter = _mm512_max_ps(_mm512_fnmadd_ps(half, steep[axis], middle), enter);
+                leave = _mm512_min_ps(_mm512_fmadd_ps(half, steep[axis], middle), leave);
+            }
+            let these = _mm512_mask_cmp_ps_mask::<_CMP_LE_OQ>(present, enter, leave);
+            met = _mm_mask_add_epi8(met, these, met, _mm_set1_epi8((1_u8 << slot) as i8));
+        }
+        met
+    }
+}
+
+/// The four components of 16 rays, each in a vector of its own.
+#[inline(always)]
+unsafe fn transpose(ids: &[u16; 16], rays: &[BoxRay]) -> [__m512; 4] {
+    // SAFETY: ids are rays, each of four numbers
+    unsafe {
+        let mut rows = [_mm512_setzero_ps(); 4];
+        for (i, row) in rows.iter_mut().enumerate() {
+            *row = _mm512_castps128_ps512(four_of(rays, ids[i]));
+            *row = _mm512_insertf32x4::<1>(*row, four_of(rays, ids[i + 4]));
+            *row = _mm512_insertf32x4::<2>(*row, four_of(rays, ids[i + 8]));
+            *row = _mm512_insertf32x4::<3>(*row, four_of(rays, ids[i + 12]));
+        }
+        let [a, b, c, d] = rows;
+        let (ab, cd) = (_mm512_unpacklo_ps(a, b), _mm512_unpacklo_ps(c, d));
+        let xy = [_mm512_castps_pd(ab), _mm512_castps_pd(cd)];
+        let (ab, cd) = (_mm512_unpackhi_ps(a, b), _mm512_unpackhi_ps(c, d));
+        let zw = [_mm512_castps_pd(ab), _mm512_castps_pd(cd)];
+        [
+            _mm512_castpd_ps(_mm512_unpacklo_pd(xy[0], xy[1])),
+            _mm512_castpd_ps(_mm512_unpackhi_pd(xy[0], xy[1])),
+            _mm512_castpd_ps(_mm512_unpacklo_pd(zw[0], zw[1])),
+            _mm512_castpd_ps(_mm512_unpackhi_pd(zw[0], zw[1])),
+        ]
+    }
+}
+
+/// A ray as four numbers.
+#[inline(always)]
+unsafe fn four_of(rays: &[BoxRay], id: u16) -> __m128 {
+    // SAFETY: the id is a ray's
+    unsafe { _mm_load_ps(std::ptr::from_ref(rays.get_unchecked(usize::from(id))).cast()) }
 }
 
 /// The vertices of a tile's triangles, per corner.

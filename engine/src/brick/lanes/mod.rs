@@ -5,7 +5,7 @@
 
 use glam::IVec3;
 
-use super::bundle::{BoxRay, RAYS_MAX};
+use super::bundle::{BoxOrigins, BoxRay};
 use super::leaf::Layout;
 use super::node::{Node, WIDTH};
 
@@ -89,11 +89,11 @@ impl Planes {
 /// must be below the lengths of the slices they index.
 pub trait Lanes {
     /// Writes those of `ids` that are alive to `out`, in order, and returns how many. `out` is at least
-    /// `ids.len() + SLACK` long, and `alive` has whole blocks of 64 words up to the last ray's.
+    /// `ids.len() + SLACK` long.
     ///
     /// # Safety
     /// See the trait.
-    unsafe fn filter(alive: &[u16], ids: &[u16], out: &mut [u16]) -> usize;
+    unsafe fn filter(alive: &[u32], ids: &[u16], out: &mut [u16]) -> usize;
 
     /// Decodes a node's boxes relative to `reference`; `origins` is the box of the origins, likewise.
     ///
@@ -115,18 +115,18 @@ pub trait Lanes {
     /// See the trait.
     unsafe fn order(distance2: &[f32; WIDTH], open: u8, out: &mut [u8; 2 * WIDTH]);
 
-    /// Ends a ray: takes it from those that are alive.
-    ///
-    /// # Safety
-    /// See the trait.
-    unsafe fn end(alive: &mut [u16; RAYS_MAX / 16], ray: u16);
-
     /// Writes to `masks`, for each of `ids`, the boxes that its ray meets, one bit a box, and returns the boxes that any
     /// meets. `masks` is at least `ids.len() + SLACK` long.
     ///
     /// # Safety
     /// See the trait.
-    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8;
+    unsafe fn meet_boxes(
+        boxes: &Boxes,
+        rays: &[BoxRay],
+        origins: &BoxOrigins,
+        ids: &[u16],
+        masks: &mut [u8],
+    ) -> u8;
 
     /// Writes those of `ids` whose mask has bit `slot` to `out`, in order, and returns how many. `out` is at least
     /// `ids.len() + SLACK` long, `masks` too.

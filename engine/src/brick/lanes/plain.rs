@@ -3,7 +3,7 @@
 use glam::{IVec3, Vec3};
 
 use super::{BOX_ERROR, Boxes, Corners, Lanes, Look, Planes};
-use crate::brick::bundle::{BoxRay, RAYS_MAX};
+use crate::brick::bundle::{BoxOrigins, BoxRay};
 use crate::brick::leaf::{FACES_MAX, Kind, Layout, VERTICES_MAX};
 use crate::brick::node::{LOCATION_BITS, Node, WIDTH};
 
@@ -13,11 +13,11 @@ pub struct Plain;
 
 impl Lanes for Plain {
     #[inline(always)]
-    unsafe fn filter(alive: &[u16], ids: &[u16], out: &mut [u16]) -> usize {
+    unsafe fn filter(alive: &[u32], ids: &[u16], out: &mut [u16]) -> usize {
         let mut count = 0;
         for &id in ids {
             out[count] = id;
-            count += usize::from(alive[usize::from(id) / 16] >> (id % 16) & 1);
+            count += (alive[usize::from(id) / 32] >> (id % 32) & 1) as usize;
         }
         count
     }
@@ -71,19 +71,21 @@ impl Lanes for Plain {
     }
 
     #[inline(always)]
-    unsafe fn end(alive: &mut [u16; RAYS_MAX / 16], ray: u16) {
-        alive[usize::from(ray) / 16] &= !(1 << (ray % 16));
-    }
-
-    #[inline(always)]
-    unsafe fn meet_boxes(boxes: &Boxes, rays: &[BoxRay], ids: &[u16], masks: &mut [u8]) -> u8 {
+    unsafe fn meet_boxes(
+        boxes: &Boxes,
+        rays: &[BoxRay],
+        origins: &BoxOrigins,
+        ids: &[u16],
+        masks: &mut [u8],
+    ) -> u8 {
         let mut any = 0;
         for (&id, mask) in ids.iter().zip(masks) {
             let ray = &rays[usize::from(id)];
             let mut enter = [0.0_f32; WIDTH];
             let mut leave = [f32::MAX; WIDTH];
             for axis in 0..3 {
-                let (inverse, offset) = (ray.inverse[axis], ray.offset[axis]);
+                let inverse = ray.inverse[axis];
+                let offset = origins[axis][ray.origin as usize] * inverse;
                 for slot in 0..WIDTH {
                     let middle = boxes.center[axis][slot].mul_add(inverse, -offset);
                     let half = boxes.half[axis][slot];

@@ -35,8 +35,7 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
                     let extinction = face_extinction(u16::from_le_bytes([record[0], record[1]]));
                     for i in 0..met {
                         let ray = self.scratch.far[i];
-                        // SAFETY: as the caller's
-                        unsafe { self.extinguish(ray, extinction) };
+                        self.bundle.extinguish(ray, extinction);
                     }
                 }
             }
@@ -54,8 +53,7 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
             let ray = self.scratch.far[i];
             let direction = Vec3::from_slice(&self.bundle.directions[usize::from(ray)][..3]);
             let extinction = aggregate.extinction(direction, half);
-            // SAFETY: as the caller's
-            unsafe { self.extinguish(ray, extinction) };
+            self.bundle.extinguish(ray, extinction);
         }
     }
 
@@ -77,8 +75,7 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
                 let direction = Vec3::from_slice(&self.bundle.directions[usize::from(ray)][..3]);
                 let (enter, leave) = far::pass(direction, &bounds);
                 if plate.is_met(direction, &bounds, enter, leave) {
-                    // SAFETY: as the caller's
-                    unsafe { self.extinguish(ray, EXTINCTION_OPAQUE) };
+                    self.bundle.extinguish(ray, EXTINCTION_OPAQUE);
                 }
                 at += 1;
             }

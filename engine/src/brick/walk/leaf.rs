@@ -154,18 +154,6 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
         }
     }
 
-    /// Adds extinction to a ray and ends it if that passes its limit.
-    ///
-    /// # Safety
-    /// The instruction set of `L` is available.
-    #[inline(always)]
-    pub(super) unsafe fn extinguish(&mut self, ray: u16, extinction: u32) {
-        if self.bundle.add(ray, extinction) {
-            // SAFETY: rays in lists are the bundle's
-            unsafe { L::end(&mut self.bundle.alive, ray) };
-        }
-    }
-
     /// Adds the extinction of the faces in the mask to a ray.
     ///
     /// # Safety
@@ -182,8 +170,7 @@ impl<L: Lanes, B: Bricks> Walk<'_, L, B> {
                 faces &= faces - 1;
             }
         }
-        // SAFETY: as the caller's
-        unsafe { self.extinguish(ray, extinction) };
+        self.bundle.extinguish(ray, extinction);
     }
 }
 

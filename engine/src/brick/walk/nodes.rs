@@ -51,7 +51,6 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             lanes: std::marker::PhantomData,
         };
         walk.scratch.stack.clear();
-        let words = walk.bundle.len().div_ceil(16).next_multiple_of(64);
         let count = rays.len();
         match bricks.locate(start.brick) {
             Location::Resident(at) => {
@@ -78,9 +77,8 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
             }
             let scratch = &mut *walk.scratch;
             // SAFETY: `current` has room for all rays of a bundle and the slack
-            let count = unsafe {
-                L::filter(&walk.bundle.alive[..words], &scratch.lists[first..end], &mut scratch.current)
-            };
+            let count =
+                unsafe { L::filter(&walk.bundle.alive, &scratch.lists[first..end], &mut scratch.current) };
             if count == 0 {
                 continue;
             }
@@ -128,8 +126,9 @@ impl<'a, L: Lanes, B: Bricks> Walk<'a, L, B> {
         }
 
         // Test the rays
+        let Bundle { box_rays, box_origins, .. } = &*self.bundle;
         // SAFETY: ray numbers in lists are below the bundle's length; `masks` has the slack
-        let met = unsafe { L::meet_boxes(boxes, &self.bundle.box_rays, &current[..count], masks) } & !beyond;
+        let met = unsafe { L::meet_boxes(boxes, box_rays, box_origins, &current[..count], masks) } & !beyond;
 
         // Look up what lies elsewhere
         let (mut instances, mut missing) = (0_u8, 0_u8);
