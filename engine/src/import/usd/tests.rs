@@ -446,7 +446,7 @@ fn many_curves_are_read_in_parts() {
         format!("({x},{y},0),({x},{y},1)")
     });
     let points = points.collect::<Vec<_>>().join(",");
-    let widths = (0..count).map(|i| if i.is_multiple_of(2) { "0.5,0.125" } else { "0.25,0.0625" });
+    let widths = (0..count).map(|i: usize| if i.is_multiple_of(2) { "0.5,0.125" } else { "0.25,0.0625" });
     let widths = widths.collect::<Vec<_>>().join(",");
     let counts = vec!["2"; count].join(",");
     let text = format!(
