@@ -9,6 +9,8 @@ pub mod inputs;
 pub mod map;
 mod run;
 pub mod set;
+#[cfg(test)]
+mod tests;
 pub mod tracer;
 pub mod work;
 
