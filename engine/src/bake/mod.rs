@@ -10,6 +10,8 @@ pub mod inputs;
 pub mod map;
 mod run;
 pub mod set;
+#[cfg(test)]
+mod tests;
 pub mod tracer;
 pub mod work;
 
