@@ -13,7 +13,7 @@ use protocol::Role;
 use serde_json::{Value, json};
 use worker::run::run;
 
-use super::{SCENE, Service, TENT, bakes};
+use super::{Service, bakes};
 
 /// Width and height of the pictures that are compared.
 const SIZE: [u32; 2] = [480, 320];
