@@ -1,12 +1,13 @@
 //! The tracer beside Embree: same scene, points, directions and threads, alternating in one run.
 //!
-//! `cargo bench -p engine --bench embree -- [--scene NAME]... [--lod LOD]... [--library PATH] [--threads N] [--repeats N]`
+//! `cargo bench -p engine --bench embree -- [--scene NAME]... [--lod LOD]... [--library PATH] [--farfield KIND] [--threads N]
+//! [--repeats N] [--maps FOLDER]`
 //!
 //! Embree 4 is found at run time (`libembree4.so.4` by default; the library inside the Python wheel `embreex` serves as
 //! well); without it only the tracer is timed. Points are whole batches: 2048 neighbours around each of a few places,
 //! along the Hilbert curve. Embree's time has neither the making of rays nor their projection in it, the tracer's
 //! has both. Rates are per second of CPU time, so that other work on the machine counts only where it takes caches and
-//! clock. Files are looked for in `$PANTARAY_ASSETS`.
+//! clock. Files are looked for in `$PANTARAY_ASSETS`; brick maps stay in the folder given by `--maps`.
 
 mod library;
 mod scenes;
@@ -23,6 +24,7 @@ use engine::cut::{Arena, Lod};
 use engine::math::Bounds;
 use engine::scene::ShOcclusion;
 use engine::shade::sample::{Sampler, Spread};
+use engine::shade::sh_occlusion::half_split_error;
 use engine::stream::{Microgrid, MicrogridStream};
 use engine::trace::{BatchCounts, Shading, SphericalTracer, TraceOptions, bake_set_hash};
 use glam::{DVec3, Vec3};
@@ -44,6 +46,7 @@ struct Arguments {
     rays: u32,
     errors: bool,
     maps: Option<PathBuf>,
+    far_field: FarField,
 }
 
 impl Arguments {
@@ -58,6 +61,7 @@ impl Arguments {
             rays: 512,
             errors: false,
             maps: None,
+            far_field: FarField::Paper,
         };
         let mut words = std::env::args().skip(1);
         while let Some(word) = words.next() {
@@ -70,6 +74,7 @@ impl Arguments {
                 "--repeats" => read.repeats = value().parse().expect("a number"),
                 "--batches" => read.batches = value().parse().expect("a number"),
                 "--rays" => read.rays = value().parse().expect("a number"),
+                "--farfield" => read.far_field = value().parse().expect("a far field"),
                 "--maps" => read.maps = Some(value().into()),
                 "--errors" => read.errors = true,
                 "--bench" => {}
@@ -91,13 +96,13 @@ fn main() {
     let arguments = Arguments::read();
     let assets = std::env::var_os("PANTARAY_ASSETS").map(PathBuf::from);
     println!(
-        "| scene | micropolygons | bytes each | what | M rays/s/core | x Embree | V_00 | RMSE to off | RMSE to 16k | visits a ray: nodes, leaves | tests a ray: nodes, leaves |"
+        "| scene | micropolygons | bytes each | what | M rays/s/core | x Embree | V_00 | RMSE to off | RMSE to 16k | half-split error | visits a ray: nodes, leaves | tests a ray: nodes, leaves |"
     );
-    println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |");
+    println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |");
     for name in &arguments.scenes {
         match scenes::scene(name, assets.as_deref()) {
             Some(mut stream) => compare(name, stream.as_mut(), &arguments),
-            None => println!("| {name} | not there | | | | | | | | | |"),
+            None => println!("| {name} | not there | | | | | | | | | | |"),
         }
     }
 }
@@ -113,10 +118,8 @@ struct Bench {
 fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let batches = batches(stream, arguments.batches);
-    let map = match &arguments.maps {
-        Some(maps) => build_map(stream, &maps.join(name)),
-        None => build_map(stream, folder.path()),
-    };
+    let kept = arguments.maps.as_ref().map(|maps| maps.join(format!("{name}-{:?}", arguments.far_field)));
+    let map = build_map(stream, kept.as_deref().unwrap_or(folder.path()), arguments.far_field);
     let (triangles, embree) = embree(stream, &arguments.library);
     let shader = ShOcclusion { samples: arguments.rays, ..ShOcclusion::default() };
     let bench = Bench { map, batches, shader, threads: arguments.threads };
@@ -149,7 +152,7 @@ fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) 
     let best = embree.as_ref().map(|_| {
         let rates = QUERIES.iter().zip(&seconds).map(|(query, seconds)| (rate(seconds), query));
         let (best, query) = rates.max_by(|a, b| a.0.total_cmp(&b.0)).expect("there are queries");
-        println!("| {name} | {triangles} triangles | | Embree, {query:?} | {best:.2} | 1 | | | | | |");
+        println!("| {name} | {triangles} triangles | | Embree, {query:?} | {best:.2} | 1 | | | | | | |");
         best
     });
     let reference = arguments.errors.then(|| bench.reference());
@@ -161,9 +164,14 @@ fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) 
             other.map_or("-".into(), |other| format!("{:.4}", rmse(values, other)))
         };
         println!(
-            "| {name} | {polygons} | {bytes:.1} | `--lod {lod}` | {rate:.2} | {ratio} | {mean:.4} | {} | {} | {:.2}, {:.2} | {:.1}, {:.1} |",
+            "| {name} | {polygons} | {bytes:.1} | `--lod {lod}` | {rate:.2} | {ratio} | {mean:.4} | {} | {} | {} | {:.2}, {:.2} | {:.1}, {:.1} |",
             to((i > 0).then_some(&found[0].0)),
             to(reference.as_ref()),
+            if arguments.errors {
+                format!("{:.4}", bench.half_split_error(&mut tracers[i]))
+            } else {
+                "-".into()
+            },
             counts.walk.nodes as f64 / rays as f64,
             counts.walk.leaves as f64 / rays as f64,
             counts.walk.node_rays as f64 / rays as f64,
@@ -209,12 +217,26 @@ impl Bench {
     }
 
     fn trace_with(&self, tracer: &mut SphericalTracer, shader: &ShOcclusion) -> (Vec<f32>, BatchCounts) {
-        let shading = Shading::new(shader, SEED, NAME, self.map.shift(0));
+        self.shade(tracer, &Shading::new(shader, SEED, NAME, self.map.shift(0)))
+    }
+
+    /// The root mean square of what the points' own rays say about their error.
+    fn half_split_error(&self, tracer: &mut SphericalTracer) -> f64 {
+        let shading = Shading::new(&self.shader, SEED, NAME, self.map.shift(0)).with_halves();
+        let (values, _) = self.shade(tracer, &shading);
+        let points = values.chunks_exact(shading.values());
+        let squares = points
+            .clone()
+            .map(|values| f64::from(half_split_error(&values[shading.coefficients()..])).powi(2));
+        (squares.sum::<f64>() / points.len() as f64).sqrt()
+    }
+
+    fn shade(&self, tracer: &mut SphericalTracer, shading: &Shading) -> (Vec<f32>, BatchCounts) {
         let (mut all, mut counts) = (Vec::new(), BatchCounts::default());
         for batch in &self.batches {
             let start = all.len();
-            all.resize(start + batch.len() * shading.coefficients(), 0.0);
-            let batch = tracer.trace(batch, &shading, &AtomicBool::new(false), &mut all[start..]);
+            all.resize(start + batch.len() * shading.values(), 0.0);
+            let batch = tracer.trace(batch, shading, &AtomicBool::new(false), &mut all[start..]);
             let batch = batch.expect("the batch traces");
             counts.walk += batch.walk;
             counts.select_seconds += batch.select_seconds;
@@ -261,12 +283,16 @@ impl Bench {
     }
 }
 
-fn build_map(stream: &mut dyn MicrogridStream, folder: &std::path::Path) -> Arc<BrickMap> {
+fn build_map(
+    stream: &mut dyn MicrogridStream,
+    folder: &std::path::Path,
+    far_field: FarField,
+) -> Arc<BrickMap> {
     let options = BuildOptions {
         memory_bytes: 1 << 30,
         threads: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
         scratch: folder.join("scratch"),
-        far_field: FarField::Paper,
+        far_field,
     };
     let target = folder.join("map");
     if target.exists() {

@@ -30,6 +30,8 @@ pub struct Shading {
     pub(super) sampler: Sampler,
     /// Lattice shift of the geometry that the points lie on.
     shift: u8,
+    /// Whether the halves of every point's rays are projected too.
+    pub(super) has_halves: bool,
 }
 
 impl Shading {
@@ -37,7 +39,13 @@ impl Shading {
     /// (0 if it is no occluder).
     pub fn new(shader: &ShOcclusion, seed: u64, bake_set: &str, shift: u8) -> Self {
         let sampler = Sampler::new(shader.samples, seed, bake_set_hash(bake_set));
-        Self { shader: shader.clone(), sampler, shift }
+        Self { shader: shader.clone(), sampler, shift, has_halves: false }
+    }
+
+    /// With what [`half_split_error`](crate::shade::sh_occlusion::half_split_error) needs: as many numbers again after every
+    /// point's coefficients. The CPU computes them.
+    pub fn with_halves(self) -> Self {
+        Self { has_halves: true, ..self }
     }
 
     /// The unit normal and the spread of directions of a point.
@@ -50,6 +58,11 @@ impl Shading {
     /// Coefficients of a point.
     pub fn coefficients(&self) -> usize {
         (self.shader.bands * self.shader.bands) as usize
+    }
+
+    /// Numbers that are computed at a point: its coefficients, and what [`with_halves`](Self::with_halves) adds.
+    pub fn values(&self) -> usize {
+        self.coefficients() * if self.has_halves { 2 } else { 1 }
     }
 }
 

@@ -15,7 +15,7 @@ use crate::brick::lanes::InstructionSet;
 use crate::brick::walk::{Bricks, Counts, Scratch, Start, Waiting, walk};
 use crate::cut::arena::ArenaCounts;
 use crate::cut::{Arena, Lod};
-use crate::shade::sh_occlusion::project;
+use crate::shade::sh_occlusion::{project, project_halves};
 use crate::{Error, ErrorKind, Result};
 
 /// Bytes of waiting rays after which no new bundles are begun.
@@ -121,7 +121,7 @@ impl SphericalTracer {
         Prepared::new(points, shading, &mut self.arena, &self.options, self.meters_per_unit)
     }
 
-    /// Traces a batch and writes `shading.coefficients()` numbers per point to `out`, in the points' order.
+    /// Traces a batch and writes `shading.values()` numbers per point to `out`, in the points' order.
     ///
     /// # Errors
     /// When bricks cannot be read, or [`ErrorKind::Cancelled`] as soon as `cancel` is set.
@@ -156,7 +156,7 @@ impl SphericalTracer {
         counts: &mut BatchCounts,
         out: &mut [f32],
     ) -> Result<()> {
-        let coefficients = job.shading.coefficients();
+        let values_each = job.shading.values();
         out.fill(0.0);
         // Parts of one point are added up in their order at the end
         let mut partial: Vec<(usize, Vec<f32>)> = Vec::new();
@@ -177,7 +177,7 @@ impl SphericalTracer {
                     (piece, Outcome::Done(values)) => {
                         let Piece { points, samples } = &job.setup.pieces[piece];
                         if samples.len() == job.shading.shader.samples as usize {
-                            out[points.start * coefficients..points.end * coefficients]
+                            out[points.start * values_each..points.end * values_each]
                                 .copy_from_slice(&values);
                         } else {
                             partial.push((piece, values));
@@ -193,8 +193,8 @@ impl SphericalTracer {
         }
         partial.sort_unstable_by_key(|(piece, _)| *piece);
         for (piece, values) in partial {
-            let at = job.setup.pieces[piece].points.start * coefficients;
-            out[at..at + coefficients].iter_mut().zip(values).for_each(|(out, value)| *out += value);
+            let at = job.setup.pieces[piece].points.start * values_each;
+            out[at..at + values_each].iter_mut().zip(values).for_each(|(out, value)| *out += value);
         }
         for worker in &mut self.workers {
             counts.walk += std::mem::take(&mut worker.scratch.counts);
@@ -322,15 +322,19 @@ impl Job<'_> {
         }
     }
 
-    /// The coefficients of a piece's points.
+    /// The numbers of a piece's points.
     fn project(&self, piece: &Piece, bundle: &Bundle) -> Vec<f32> {
-        let coefficients = self.shading.coefficients();
-        let mut values = vec![0.0; piece.points.len() * coefficients];
+        let mut values = vec![0.0; piece.points.len() * self.shading.values()];
         let each = piece.samples.len();
-        for (i, out) in values.chunks_exact_mut(coefficients).enumerate() {
+        for (i, out) in values.chunks_exact_mut(self.shading.values()).enumerate() {
             let (_, spread) = self.shading.spread(self.points[piece.points.start + i].normal);
             let bands = self.shading.shader.bands as usize;
-            project(bundle, i * each..(i + 1) * each, &self.shading.sampler, spread, bands, out);
+            let (out, halves) = out.split_at_mut(self.shading.coefficients());
+            let (rays, sampler) = (i * each..(i + 1) * each, &self.shading.sampler);
+            project(bundle, rays.clone(), sampler, spread, bands, out);
+            if self.shading.has_halves {
+                project_halves(bundle, rays, sampler, spread, bands, halves);
+            }
         }
         values
     }

@@ -148,7 +148,8 @@ impl GpuTracer {
         out: &mut [f32],
     ) -> Result<BatchCounts> {
         for is_second in [false, true] {
-            if self.lanes.is_empty() {
+            // Devices do not project halves
+            if self.lanes.is_empty() || shading.has_halves {
                 break;
             }
             match self.attempt(points, shading, next, cancel, out) {
