@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use engine::bake::Control;
 use engine::dice::Rate;
-use engine::import::{EXTENSIONS, ImportOptions, ImportReport, Part, Parts, import_parts, is_importable};
-use engine::scene::Dice;
+use engine::import::{
+    EXTENSIONS, Expected, ImportOptions, ImportReport, Part, Parts, Step, import_parts, is_importable,
+};
+use engine::scene::{Camera, Dice, Edge};
 use engine::stream::MicrogridStream;
 use engine::stream::adapt::{Concat, Convert};
 use engine::stream::file::MgsReader;
@@ -37,9 +39,13 @@ pub struct Arguments {
     /// The time code at which USD is read [default: its default values]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     frame: Option<f64>,
-    /// Dice faces, and subdivision surfaces on their limit, to edges of SIZE units, or of PIXELS (1) pixels of a camera
-    #[arg(long, value_name = "world:SIZE|camera:NAME[:PIXELS]")]
+    /// Dice faces, and subdivision surfaces on their limit, to edges of SIZE units, or of PIXELS (1) pixels of a camera;
+    /// leaves along their texture to edges of N (2) texels
+    #[arg(long, value_name = "world:SIZE|camera:NAME[:PIXELS][,texels:N]")]
     dice: Option<String>,
+    /// Micropolygons that the leaves of a file may become
+    #[arg(long, value_name = "N", default_value_t = 1 << 28, value_parser = clap::value_parser!(u64).range(1..))]
+    leaves_max: u64,
     /// The scene file whose camera `--dice` names
     #[arg(long, value_name = "SCENE", requires = "dice")]
     scene: Option<PathBuf>,
@@ -69,14 +75,16 @@ struct Input {
 
 /// Imports and says what was read, left out and written.
 pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
-    let Arguments { inputs, output, space, memory, frame, dice, scene } = arguments;
-    let dice = dice.map(|dice| rate(&dice, scene.as_deref())).transpose()?;
+    let Arguments { inputs, output, space, memory, frame, dice, leaves_max, scene } = arguments;
+    let dice = dice.map(|dice| Dice::parse(&dice)).transpose()?.unwrap_or_default();
     let options = ImportOptions {
         meters_per_unit: space.units,
         up: space.up.into(),
         memory_bytes: memory,
         frame,
-        dice,
+        dice: Rate::of(&dice, &cameras(&dice, scene.as_deref())?)?,
+        texels: dice.texels,
+        leaves_max,
         ..ImportOptions::default()
     };
     let inputs = import_all(&inputs, &output, &options, console.control())?;
@@ -92,19 +100,15 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
     Answer::new(&imported, imported.describe())
 }
 
-/// How fine to dice, by a camera of a scene if one is named.
-fn rate(dice: &str, scene: Option<&Path>) -> Result<Rate> {
-    let dice = Dice::parse(dice)?;
-    let cameras = match (&dice, scene) {
-        (Dice::Camera { .. }, Some(scene)) => engine::scene::load(scene)?.cameras,
-        (Dice::Camera { .. }, None) => {
-            return Err(
-                Error::invalid("no scene says where the camera stands").hint("name one: `--scene SCENE`")
-            );
+/// The cameras of the scene, if one is needed to dice.
+fn cameras(dice: &Dice, scene: Option<&Path>) -> Result<Vec<Camera>> {
+    match (&dice.edge, scene) {
+        (Some(Edge::Camera { .. }), Some(scene)) => Ok(engine::scene::load(scene)?.cameras),
+        (Some(Edge::Camera { .. }), None) => {
+            Err(Error::invalid("no scene says where the camera stands").hint("name one: `--scene SCENE`"))
         }
-        (Dice::World(_), _) => Vec::new(),
-    };
-    Rate::of(&dice, &cameras)
+        _ => Ok(Vec::new()),
+    }
 }
 
 /// Imports each file beside the output, then joins what there is.
@@ -127,7 +131,13 @@ fn import_all(
         }
         control.progress.update("import", 0.0, &path.to_string_lossy());
         let target = scratch.path().join(format!("{number}.mgs"));
-        let (parts, report) = import_parts(path, &target, options, &mut || check(control))?;
+        let mut watch = |step| {
+            if let Step::Begin(expected) = step {
+                control.progress.update("import", 0.0, &describe(path, &expected));
+            }
+            check(control)
+        };
+        let (parts, report) = import_parts(path, &target, options, &mut watch)?;
         let ImportReport { grids, micropolygons, vertices, skipped, warnings, .. } = report;
         found.push(Input { path: path.into(), grids, micropolygons, vertices, skipped, warnings });
         all.push(parts);
@@ -143,6 +153,15 @@ fn import_all(
         _ => join(&all, output, options, control)?,
     }
     Ok(found)
+}
+
+/// What is about to be read.
+fn describe(path: &Path, expected: &Expected) -> String {
+    let mut text = format!("{}: needs {} of memory", path.display(), figures::bytes(expected.memory_bytes));
+    if expected.leaves > 0 {
+        text += &format!(", leaves become {} micropolygons", figures::count(expected.leaves));
+    }
+    text
 }
 
 /// Writes all streams one after the other.

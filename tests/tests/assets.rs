@@ -262,7 +262,7 @@ fn terrain_far_from_the_origin() {
     let near = Case::new("m", "z").expect("as before");
     let (source, moved) = (near.folder.path().join("far.mgs"), near.folder.path().join("near.mgs"));
     let options = ImportOptions { up: UpAxis::Z, ..ImportOptions::default() };
-    import_parts(&near.assets.join("terrain_dem/terrain_far_quads.obj"), &source, &options, &mut || Ok(()))
+    import_parts(&near.assets.join("terrain_dem/terrain_far_quads.obj"), &source, &options, &mut |_| Ok(()))
         .unwrap();
     let mut reader = MgsReader::open(&source).unwrap();
     let mut writer = MgsWriter::create(&moved, reader.schema(), &[]).unwrap();

@@ -10,7 +10,7 @@ use super::folder::write_atomically;
 use crate::dice::Rate;
 use crate::import::{ImportOptions, ImportReport, Part, Parts, SavedParts, import_parts, is_importable};
 use crate::scene::instances::InstanceReader;
-use crate::scene::{Geometry, Instances, Scene, StreamSource};
+use crate::scene::{Dice, Geometry, Instances, Scene, StreamSource};
 use crate::stream::MicrogridStream;
 use crate::stream::adapt::{Concat, Convert, Instance, MatrixSource};
 use crate::stream::file::MgsReader;
@@ -39,6 +39,12 @@ struct Saved {
 
 const SAVED_FILE: &str = "inputs.json";
 const SAVED_VERSION: u32 = 2;
+
+/// Options that dice as a stream asks for.
+fn diced(options: &ImportOptions, dice: Option<&Dice>, scene: &Scene) -> Result<ImportOptions> {
+    let rate = dice.map(|dice| Rate::of(dice, &scene.cameras)).transpose()?.flatten();
+    Ok(ImportOptions { dice: rate, texels: dice.and_then(|dice| dice.texels), ..options.clone() })
+}
 
 impl Inputs {
     /// Imports the files of `scene` that are no microgrid streams into `folder`, and takes the identity of everything. Of
@@ -88,10 +94,8 @@ impl Inputs {
                             Some((_, parts)) => parts.clone(),
                             None => {
                                 let target = folder.join(format!("{}.mgs", imported.len()));
-                                let mut watch = || progress(done as f64 / total as f64);
-                                let dice =
-                                    dice.as_ref().map(|dice| Rate::of(dice, &scene.cameras)).transpose()?;
-                                let options = ImportOptions { dice, ..options.clone() };
+                                let mut watch = |_| progress(done as f64 / total as f64);
+                                let options = diced(&options, dice.as_ref(), scene)?;
                                 let (parts, report) = import_parts(path, &target, &options, &mut watch)?;
                                 inputs.reports.push((path.clone(), report));
                                 imported.push((source.clone(), parts.clone()));

@@ -2,7 +2,7 @@
 
 use glam::{DMat4, DVec3};
 
-use crate::scene::{Camera, Dice};
+use crate::scene::{Camera, Dice, Edge};
 use crate::{Error, Result};
 
 /// Segments of an edge are a power of two; this is the largest power.
@@ -31,15 +31,16 @@ pub struct CameraRate {
 const NEAREST: f64 = 1e-6;
 
 impl Rate {
-    /// The rate that a scene or the command line asks for.
+    /// The rate that a scene or the command line asks for, if any.
     ///
     /// # Errors
     /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) for a camera that is not there.
-    pub fn of(dice: &Dice, cameras: &[Camera]) -> Result<Self> {
-        match (dice, dice.camera(cameras)?) {
-            (Dice::Camera { pixels, .. }, Some(camera)) => Self::camera(camera, *pixels),
-            (Dice::World(size), _) => Self::world(*size),
-            (Dice::Camera { name, .. }, None) => Err(Error::invalid(format!("no camera `{name}`"))),
+    pub fn of(dice: &Dice, cameras: &[Camera]) -> Result<Option<Self>> {
+        match (&dice.edge, dice.camera(cameras)?) {
+            (Some(Edge::Camera { pixels, .. }), Some(camera)) => Self::camera(camera, *pixels).map(Some),
+            (Some(Edge::World(size)), _) => Self::world(*size).map(Some),
+            (Some(Edge::Camera { name, .. }), None) => Err(Error::invalid(format!("no camera `{name}`"))),
+            (None, _) => Ok(None),
         }
     }
 

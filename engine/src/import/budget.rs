@@ -23,20 +23,26 @@ impl Budget {
     /// Takes `bytes` for `what`, before they are allocated.
     pub fn take(&mut self, bytes: u64, what: &str) -> Result<()> {
         let need = self.held.saturating_add(bytes);
-        if need > self.limit {
-            return Err(Error::new(
-                ErrorKind::Limit,
-                format!(
-                    "{what} would take the import to {} MiB, {} MiB are allowed",
-                    need.div_ceil(MIB),
-                    self.limit / MIB
-                ),
-            )
-            .at(&self.path)
-            .hint("allow more memory (`--memory`), or cut the file into parts"));
-        }
+        self.check(need, what)?;
         self.held = need;
         Ok(())
+    }
+
+    /// Refuses a need of `bytes`, all together, that `what` would cause.
+    pub fn check(&self, bytes: u64, what: &str) -> Result<()> {
+        if bytes <= self.limit {
+            return Ok(());
+        }
+        let (need, have) = (bytes.div_ceil(MIB), self.limit / MIB);
+        let message = format!("{what} would take the import to {need} MiB, {have} MiB are allowed");
+        Err(Error::new(ErrorKind::Limit, message)
+            .at(&self.path)
+            .hint("allow more memory (`--memory`), or cut the file into parts"))
+    }
+
+    /// Bytes held now.
+    pub fn held(&self) -> u64 {
+        self.held
     }
 
     /// Gives back `bytes`.

@@ -120,13 +120,14 @@ impl Placement {
 /// Hands grids to a sink and counts them.
 pub(super) struct Emitter<'a> {
     sink: &'a mut dyn GridSink,
-    schema: Schema,
+    pub schema: Schema,
     carried: Carried,
-    grid: Microgrid,
+    pub grid: Microgrid,
     table: VertexTable,
     /// Power of two per position, see [`Emitter::measure`]; empty when positions are written as they are.
-    exponents: Vec<i16>,
-    points: Vec<DVec3>,
+    pub exponents: Vec<i16>,
+    /// Where the vertices of the grid stand.
+    pub points: Vec<DVec3>,
 }
 
 /// Albedo where nothing says otherwise, as everywhere in the engine: a half.
@@ -196,25 +197,41 @@ impl<'a> Emitter<'a> {
         (first_id, radius): (u32, f32),
         report: &mut ImportReport,
     ) -> Result<()> {
-        let corners = mesh.bounds();
-        let far = |p: DVec3| !placement.point(p).abs().cmple(DVec3::splat(COORDINATE_MAX)).all();
-        if !corners.is_empty() && (far(corners.min) || far(corners.max)) {
-            report.skip("copies that stand out of range", 1);
+        if self.is_out_of_range(mesh, placement, report) {
             return Ok(());
         }
         self.measure(mesh, clusters, placement);
         for cluster in clusters.iter() {
             self.fill(mesh, cluster, placement, radius);
-            let id = first_id.wrapping_add(mesh.faces[cluster[0] as usize].object);
-            let column = self.schema.attributes.len() - 1;
-            self.grid.columns[column].extend_from_slice(&id.to_le_bytes());
-            debug_assert_eq!(self.grid.validate(&self.schema).err().map(|e| e.to_string()), None);
-            report.grids += 1;
-            report.micropolygons += self.grid.face_count() as u64;
-            report.vertices += self.grid.vertex_count() as u64;
-            self.sink.grid(&self.grid)?;
+            self.hand_over(first_id.wrapping_add(mesh.faces[cluster[0] as usize].object), report)?;
         }
         Ok(())
+    }
+
+    /// Whether a copy stands beyond what can be stored; it is counted then.
+    pub fn is_out_of_range(&self, mesh: &Mesh, placement: &Placement, report: &mut ImportReport) -> bool {
+        let bounds = mesh.bounds();
+        let far = |p: DVec3| !placement.point(p).abs().cmple(DVec3::splat(COORDINATE_MAX)).all();
+        let is_far = !bounds.is_empty() && (far(bounds.min) || far(bounds.max));
+        report.skip("copies that stand out of range", u64::from(is_far));
+        is_far
+    }
+
+    /// Empties the grid.
+    pub fn begin_grid(&mut self) {
+        self.grid.clear(self.schema.attributes.len());
+        self.points.clear();
+    }
+
+    /// Hands the grid, complete but for its `id`, to the sink.
+    pub fn hand_over(&mut self, id: u32, report: &mut ImportReport) -> Result<()> {
+        let column = self.schema.attributes.len() - 1;
+        self.grid.columns[column].extend_from_slice(&id.to_le_bytes());
+        debug_assert_eq!(self.grid.validate(&self.schema).err().map(|e| e.to_string()), None);
+        report.grids += 1;
+        report.micropolygons += self.grid.face_count() as u64;
+        report.vertices += self.grid.vertex_count() as u64;
+        self.sink.grid(&self.grid)
     }
 
     /// Finds for every position the power of two to round to.
@@ -240,9 +257,8 @@ impl<'a> Emitter<'a> {
 
     /// Makes the grid of one cluster, but for its `id`.
     fn fill(&mut self, mesh: &Mesh, cluster: &[u32], placement: &Placement, radius: f32) {
-        self.grid.clear(self.schema.attributes.len());
+        self.begin_grid();
         self.table.clear();
-        self.points.clear();
         for &index in cluster {
             let face = &mesh.faces[index as usize];
             let mut indices = [0_u8; 4];
@@ -261,10 +277,18 @@ impl<'a> Emitter<'a> {
             }
             self.grid.push_face(indices);
         }
-        self.place();
+        self.place(!self.exponents.is_empty());
     }
 
-    fn push_vertex(&mut self, mesh: &Mesh, face: &Face, corner: usize, placement: &Placement, radius: f32) {
+    /// Adds a vertex with all that it carries, but for its place in the grid.
+    pub fn push_vertex(
+        &mut self,
+        mesh: &Mesh,
+        face: &Face,
+        corner: usize,
+        placement: &Placement,
+        radius: f32,
+    ) {
         let position = mesh.corners[corner] as usize;
         let variant = mesh.variant(corner);
         let mut point = placement.point(mesh.positions[position]);
@@ -316,9 +340,9 @@ impl<'a> Emitter<'a> {
         }
     }
 
-    /// Chooses the anchor and stores positions as offsets from it.
-    fn place(&mut self) {
-        if !self.exponents.is_empty() {
+    /// Chooses the anchor and stores positions as offsets from it: the origin unless they were rounded.
+    pub fn place(&mut self, rounded: bool) {
+        if rounded {
             let mut bounds = crate::math::Bounds::EMPTY;
             self.points.iter().for_each(|&point| bounds.add(point));
             let step = power_of_two(resolution(bounds.size().max_element()));

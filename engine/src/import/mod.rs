@@ -12,6 +12,7 @@ mod cut;
 mod diced;
 mod emit;
 mod gltf;
+mod leaves;
 mod lines;
 mod mesh;
 mod obj;
@@ -30,13 +31,30 @@ mod hostile;
 use std::path::Path;
 
 pub use self::assembly::Copies;
-pub use self::parts::{Part, Parts, SavedParts, import_parts};
+pub use self::parts::{Part, Parts, SavedParts, Step, import_parts};
 pub use self::usd::PRIMS_KEY;
 use crate::stream::{Microgrid, Schema, schema::UpAxis};
 use crate::{Error, Result};
 
+/// What a file takes and becomes, as far as that is known before it is read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Expected {
+    /// Bytes that the import will hold at once, at most.
+    pub memory_bytes: u64,
+    /// Micropolygons that leaves become, cut along their texture.
+    pub leaves: u64,
+}
+
 /// Receives an imported stream: the schema once, then every grid in order.
 pub trait GridSink {
+    /// Learns what is to come, before anything else.
+    ///
+    /// # Errors
+    /// When the sink does not want it; the import stops with this error.
+    fn expect(&mut self, _: &Expected) -> Result<()> {
+        Ok(())
+    }
+
     /// Learns the attributes and the space of the grids that follow, and what the file says about itself.
     ///
     /// # Errors
@@ -71,6 +89,11 @@ pub struct ImportOptions {
     pub frame: Option<f64>,
     /// How fine to dice; none keeps faces as they are.
     pub dice: Option<crate::dice::Rate>,
+    /// Texels along the edges of leaves that are cut along their texture; none means two where faces are diced, and
+    /// that leaves stay whole where they are not.
+    pub texels: Option<f64>,
+    /// Micropolygons that the leaves of a file may become.
+    pub leaves_max: u64,
     /// Seconds that may pass until a USD file yields its next prim: a broken one may take for ever.
     pub patience_seconds: u64,
 }
@@ -83,6 +106,8 @@ impl Default for ImportOptions {
             memory_bytes: 1 << 30,
             frame: None,
             dice: None,
+            texels: None,
+            leaves_max: 1 << 28,
             patience_seconds: 300,
         }
     }

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::assembly::{Assembly, SavedScopes};
-use super::{Copies, GridSink, ImportOptions, ImportReport, import};
+use super::{Copies, Expected, GridSink, ImportOptions, ImportReport, import};
 use crate::stream::adapt::{Concat, Instance};
 use crate::stream::file::{MgsReader, MgsWriter};
 use crate::stream::{Microgrid, MicrogridStream, Schema};
@@ -85,8 +85,17 @@ impl Parts {
     }
 }
 
+/// What an import is about to do.
+#[derive(Clone, Copy, Debug)]
+pub enum Step {
+    /// To read a file.
+    Begin(Expected),
+    /// To write a grid.
+    Grid,
+}
+
 /// Imports `path` into files beside `target`: `target` itself, and for prototypes the same name with a number before
-/// its extension. Calls `watch` before every grid; an error that it returns ends the import.
+/// its extension. Calls `watch` before every step; an error that it returns ends the import.
 ///
 /// # Errors
 /// As [`import`], and for a file without any geometry; no file stays then.
@@ -94,7 +103,7 @@ pub fn import_parts(
     path: &Path,
     target: &Path,
     options: &ImportOptions,
-    watch: &mut dyn FnMut() -> Result<()>,
+    watch: &mut dyn FnMut(Step) -> Result<()>,
 ) -> Result<(Parts, ImportReport)> {
     let mut sink =
         PartsSink { target, watch, begun: None, writer: None, next: None, parts: Parts::default() };
@@ -119,7 +128,7 @@ pub fn import_parts(
 
 struct PartsSink<'a> {
     target: &'a Path,
-    watch: &'a mut dyn FnMut() -> Result<()>,
+    watch: &'a mut dyn FnMut(Step) -> Result<()>,
     begun: Option<(Schema, Vec<(String, String)>)>,
     /// The part that is being written; it begins with its first grid.
     writer: Option<(MgsWriter, PathBuf)>,
@@ -139,6 +148,10 @@ impl PartsSink<'_> {
 }
 
 impl GridSink for PartsSink<'_> {
+    fn expect(&mut self, expected: &Expected) -> Result<()> {
+        (self.watch)(Step::Begin(*expected))
+    }
+
     fn begin(&mut self, schema: &Schema, metadata: &[(String, String)]) -> Result<()> {
         self.begun = Some((schema.clone(), metadata.to_vec()));
         self.parts.metadata = metadata.to_vec();
@@ -152,7 +165,7 @@ impl GridSink for PartsSink<'_> {
     }
 
     fn grid(&mut self, grid: &Microgrid) -> Result<()> {
-        (self.watch)()?;
+        (self.watch)(Step::Grid)?;
         if self.writer.is_none() {
             let (schema, metadata) = self
                 .begun

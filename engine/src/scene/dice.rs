@@ -1,15 +1,25 @@
-//! How a stream is to be diced, as scenes and the command line write it: `world:SIZE`, `camera:NAME`, `camera:NAME:PIXELS`.
+//! How a stream is to be diced, as scenes and the command line write it: `world:SIZE`, `camera:NAME`, `camera:NAME:PIXELS`,
+//! `texels:N`, or one of the former and the latter with a comma between.
 
 use super::Camera;
 use crate::error::nearest;
 use crate::{Error, Result};
 
 /// How fine to dice a stream.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Dice {
+    /// How long edges may be; none keeps faces as they are, but for leaves.
+    pub edge: Option<Edge>,
+    /// How many texels long the edges of leaves may be, where they are cut along their texture; none is two.
+    pub texels: Option<f64>,
+}
+
+/// How long edges may be.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Dice {
-    /// No edge longer than so many scene units, about.
+pub enum Edge {
+    /// So many scene units, about.
     World(f64),
-    /// No edge longer than so many pixels in the picture of a camera, about.
+    /// So many pixels in the picture of a camera, about.
     Camera {
         /// The camera's name.
         name: String,
@@ -26,23 +36,34 @@ impl Dice {
     pub fn parse(text: &str) -> Result<Self> {
         let wrong = || {
             Error::invalid(format!(
-                "`{text}` says not how to dice, expected `world:SIZE` or `camera:NAME[:PIXELS]`"
+                "`{text}` says not how to dice, expected `world:SIZE`, `camera:NAME[:PIXELS]` or `texels:N`"
             ))
-            .hint("a size is in scene units: `world:0.01`")
+            .hint("a size is in scene units: `world:0.01`; leaves are cut along their texture: `world:0.01,texels:4`")
         };
         let positive =
             |text: &str| text.parse::<f64>().ok().filter(|x| *x > 0.0 && *x <= 1e12).ok_or_else(wrong);
-        match text.split_once(':').ok_or_else(wrong)? {
-            ("world", size) => Ok(Self::World(positive(size)?)),
-            ("camera", rest) => {
-                let (name, pixels) = rest.split_once(':').unwrap_or((rest, "1"));
-                if name.is_empty() {
-                    return Err(wrong());
+        let mut dice = Self::default();
+        for part in text.split(',') {
+            let edge = match part.split_once(':').ok_or_else(wrong)? {
+                ("world", size) => Edge::World(positive(size)?),
+                ("camera", rest) => {
+                    let (name, pixels) = rest.split_once(':').unwrap_or((rest, "1"));
+                    if name.is_empty() {
+                        return Err(wrong());
+                    }
+                    Edge::Camera { name: name.into(), pixels: positive(pixels)? }
                 }
-                Ok(Self::Camera { name: name.into(), pixels: positive(pixels)? })
+                ("texels", texels) if dice.texels.is_none() => {
+                    dice.texels = Some(positive(texels)?.max(1.0));
+                    continue;
+                }
+                _ => return Err(wrong()),
+            };
+            if dice.edge.replace(edge).is_some() {
+                return Err(wrong());
             }
-            _ => Err(wrong()),
         }
+        Ok(dice)
     }
 
     /// The camera that is meant, among those there are.
@@ -50,7 +71,7 @@ impl Dice {
     /// # Errors
     /// [`ErrorKind::Invalid`](crate::ErrorKind::Invalid) for a camera that is not there.
     pub fn camera<'a>(&self, cameras: &'a [Camera]) -> Result<Option<&'a Camera>> {
-        let Self::Camera { name, .. } = self else { return Ok(None) };
+        let Some(Edge::Camera { name, .. }) = &self.edge else { return Ok(None) };
         if let Some(found) = cameras.iter().find(|camera| camera.name == *name) {
             return Ok(Some(found));
         }
@@ -67,15 +88,18 @@ mod tests {
     /// Catches a form that is misread, and nonsense that passes.
     #[test]
     fn what_is_written_is_understood() {
-        assert_eq!(Dice::parse("world:0.25").unwrap(), Dice::World(0.25));
-        let camera = |pixels| Dice::Camera { name: "shot".into(), pixels };
+        let dice = |edge, texels| Dice { edge, texels };
+        assert_eq!(Dice::parse("world:0.25").unwrap(), dice(Some(Edge::World(0.25)), None));
+        let camera = |pixels| dice(Some(Edge::Camera { name: "shot".into(), pixels }), None);
         assert_eq!(Dice::parse("camera:shot").unwrap(), camera(1.0));
         assert_eq!(Dice::parse("camera:shot:2.5").unwrap(), camera(2.5));
-        for text in
-            ["", "world", "world:", "world:0", "world:-1", "world:nan", "camera:", "camera:a:x", "pixel:1"]
-        {
+        assert_eq!(Dice::parse("texels:4").unwrap(), dice(None, Some(4.0)));
+        assert_eq!(Dice::parse("world:2,texels:8").unwrap(), dice(Some(Edge::World(2.0)), Some(8.0)));
+        let wrong = "|world|world:|world:0|world:-1|world:nan|camera:|camera:a:x|pixel:1|texels:|world:1,|world:1,camera:a";
+        for text in wrong.split('|') {
             assert!(Dice::parse(text).is_err(), "{text}");
         }
-        assert!(camera(1.0).camera(&[]).is_err() && Dice::World(1.0).camera(&[]).unwrap().is_none());
+        assert!(camera(1.0).camera(&[]).is_err());
+        assert!(dice(Some(Edge::World(1.0)), None).camera(&[]).unwrap().is_none());
     }
 }

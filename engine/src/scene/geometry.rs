@@ -8,7 +8,7 @@ use super::files::Files;
 use super::names::Names;
 use super::parse::limited;
 use super::{
-    BakeAttribute, BakeSet, Dice, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result,
+    BakeAttribute, BakeSet, Dice, Edge, ErrorKind, Geometry, Instances, Procedural, ProceduralKind, Result,
     StreamSource,
 };
 use crate::stream::schema::ATTRIBUTES_MAX;
@@ -143,10 +143,15 @@ impl<'a, 'd> Geometries<'a, 'd> {
             let placed = value.error(error.kind(), error.message());
             error.hint_text().into_iter().fold(placed, |placed, hint| placed.hint(hint))
         })?;
-        if let Dice::Camera { name, .. } = &dice
+        if let Some(Edge::Camera { name, .. }) = &dice.edge
             && !self.cameras.all().any(|known| known == name)
         {
-            return Err(value.unknown_word("camera:".len(), name, "camera", self.cameras.all()));
+            return Err(value.unknown_word(
+                value.text().find(name.as_str()).unwrap_or(0),
+                name,
+                "camera",
+                self.cameras.all(),
+            ));
         }
         Ok(dice)
     }

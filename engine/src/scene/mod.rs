@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 
 use glam::DMat4;
 
-pub use self::dice::Dice;
+pub use self::dice::{Dice, Edge};
 pub use self::files::Roots;
 pub use self::instances::{InstanceReader, for_each_instance};
 pub use self::parse::UNITS;

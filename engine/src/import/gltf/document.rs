@@ -8,6 +8,8 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 use serde_json::Value;
 
+use crate::import::leaves::texture::AlphaMode;
+
 /// Extension data by name.
 pub(super) type Extensions = BTreeMap<String, Value>;
 
@@ -179,15 +181,6 @@ pub(super) struct Sampler {
 pub(super) struct Image {
     pub uri: Option<String>,
     pub buffer_view: Option<usize>,
-}
-
-/// How alpha is read.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum AlphaMode {
-    Opaque,
-    /// Opaque from this alpha up, absent below.
-    Mask(f32),
-    Blend,
 }
 
 impl Material {

@@ -7,7 +7,6 @@ mod accessor;
 mod check;
 mod container;
 mod document;
-mod leaves;
 mod nodes;
 mod primitive;
 mod texture;
@@ -15,11 +14,12 @@ mod texture;
 use std::path::Path;
 
 use self::container::Container;
-use self::document::AlphaMode;
 use self::nodes::Copies;
 use super::emit::{Carried, Emitter, Placement};
+use super::leaves::texture::AlphaMode;
+use super::leaves::{self, Leaves};
 use super::mesh::Mesh;
-use super::{GridSink, ImportOptions, ImportReport, cut, radius};
+use super::{Expected, GridSink, ImportOptions, ImportReport, cut, radius};
 use crate::Result;
 
 /// Imports a glTF or GLB file.
@@ -28,9 +28,12 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let mut container = Container::open(path, options.memory_bytes)?;
     let copies = nodes::copies(&mut container, options, &mut report)?;
     let carried = carried(&container, &copies);
-    let wanted = primitive::Wanted { albedo: carried.albedo, leaves: options.dice.is_some() };
-    let mut emitter = Emitter::new(sink, carried, options)?;
+    let wanted = primitive::Wanted { albedo: carried.albedo, leaves: Leaves::are_wanted(options) };
+    let memory_bytes = primitive::check_memory(&mut container, &copies, wanted)?;
     let mut images = texture::Images::default();
+    let leaves = count_leaves(&mut container, &copies, &mut images, wanted, options)?;
+    sink.expect(&Expected { memory_bytes, leaves })?;
+    let mut emitter = Emitter::new(sink, carried, options)?;
     for (&mesh, places) in &copies {
         if container.document.meshes[mesh].weights.iter().any(|&weight| weight != 0.0) {
             report.warn("morph targets are not applied: meshes stand as modelled".into());
@@ -40,23 +43,64 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
             let read = primitive::read(&mut container, (mesh, index), &mut images, wanted, &mut own)?;
             add_copies(&mut report, &own, places.len() as u64);
             let Some(read) = read else { continue };
-            let Some(leaves) = read.leaves else {
-                emit(&mut emitter, &read.mesh, places, options, &mut report)?;
-                drop(read.mesh);
-                container.budget.give(read.bytes);
-                continue;
-            };
-            let mut own = ImportReport::default();
-            leaves.cut(&read.mesh, &images, &mut own, |part| {
-                emit(&mut emitter, part, places, options, &mut report)
-            })?;
-            add_copies(&mut report, &own, places.len() as u64);
-            drop(read.mesh);
-            container.budget.give(read.bytes);
-            primitive::release(&mut container, leaves.colors, Some(leaves.uvs));
+            match &read.leaves {
+                None => emit(&mut emitter, &read.mesh, places, options, &mut report)?,
+                Some(cut) => {
+                    let corner = |corner| cut.corner(&read.mesh, corner);
+                    let look = (&cut.texture, cut.alpha, cut.factor);
+                    let mut leaves = Leaves::new(&read.mesh, look, &corner, options);
+                    for (id, placement) in places {
+                        leaves.emit(&mut emitter, placement, *id, &mut report)?;
+                    }
+                }
+            }
+            read.release(&mut container);
         }
     }
     Ok(report)
+}
+
+/// How many micropolygons leaves will become; refuses more than allowed.
+fn count_leaves(
+    container: &mut Container,
+    copies: &Copies,
+    images: &mut texture::Images,
+    wanted: primitive::Wanted,
+    options: &ImportOptions,
+) -> Result<u64> {
+    let mut count = 0_u64;
+    for (&mesh, places) in copies {
+        for index in 0..container.document.meshes[mesh].primitives.len() {
+            if !wanted.leaves || !is_see_through(container, (mesh, index)) {
+                continue;
+            }
+            // What is found on the way is reported when it is read to be written
+            let read =
+                primitive::read(container, (mesh, index), images, wanted, &mut ImportReport::default())?;
+            let Some(read) = read else { continue };
+            if let Some(cut) = &read.leaves {
+                let corner = |corner| cut.corner(&read.mesh, corner);
+                let look = (&cut.texture, cut.alpha, cut.factor);
+                let mut leaves = Leaves::new(&read.mesh, look, &corner, options);
+                for (_, placement) in places {
+                    count = count.saturating_add(leaves.count(placement)?);
+                }
+            }
+            read.release(container);
+        }
+    }
+    leaves::check_count(count, options)?;
+    Ok(count)
+}
+
+/// Whether a primitive's texture may let light through.
+fn is_see_through(container: &Container, (mesh, index): (usize, usize)) -> bool {
+    let document = &container.document;
+    let material = document.meshes[mesh].primitives[index].material;
+    let material = material.and_then(|material| document.materials.get(material));
+    material.is_some_and(|material| {
+        material.alpha() != Some(AlphaMode::Opaque) && material.base().base_color_texture.is_some()
+    })
 }
 
 /// Writes a mesh wherever it stands.

@@ -3,10 +3,12 @@
 use glam::{DVec3, Vec2, Vec3};
 
 use super::container::{Container, missing, unsupported};
-use super::document::{AlphaMode, Primitive};
-use super::leaves::{self, Leaves};
-use super::texture::{Averager, Images, Texture, coverage};
+use super::document::Primitive;
+use super::nodes::Copies;
+use super::texture::Images;
 use crate::import::emit::opacity_byte;
+use crate::import::leaves;
+use crate::import::leaves::texture::{AlphaMode, Averager, Texture, coverage};
 use crate::import::mesh::{Face, Mesh};
 use crate::import::{ImportReport, polygon, srgb};
 use crate::{Error, ErrorKind, Result};
@@ -16,7 +18,8 @@ const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 2
 /// A material as far as it is read.
 pub(super) struct Surface {
     pub factor: [f32; 4],
-    pub texture: Option<Texture>,
+    /// The texture, and which set of coordinates it is looked up with.
+    pub texture: Option<(u32, Texture)>,
     pub alpha: AlphaMode,
 }
 
@@ -26,7 +29,69 @@ pub(super) struct Read {
     /// What was taken from the budget for it, to be given back.
     pub bytes: u64,
     /// What its faces are to be cut by; without it they are painted.
-    pub leaves: Option<Leaves>,
+    pub leaves: Option<Cut>,
+}
+
+/// What the faces of a primitive are cut by.
+pub(super) struct Cut {
+    pub texture: Texture,
+    pub alpha: AlphaMode,
+    pub factor: f32,
+    /// Two coordinates a vertex.
+    uvs: Vec<f32>,
+    /// Colours of vertices and their components, if there are any.
+    colors: Option<(Vec<f32>, usize)>,
+}
+
+impl Cut {
+    /// Texture coordinates and alpha of a corner of the mesh.
+    pub fn corner(&self, mesh: &Mesh, corner: usize) -> (Vec2, f32) {
+        let vertex = mesh.corners[corner] as usize;
+        (Vec2::from_slice(&self.uvs[2 * vertex..]), vertex_color(self.colors.as_ref(), vertex)[3])
+    }
+}
+
+impl Read {
+    /// Gives back what it takes.
+    pub fn release(self, container: &mut Container) {
+        container.budget.give(self.bytes);
+        if let Some(Cut { uvs, colors, .. }) = self.leaves {
+            release(container, colors, Some(uvs));
+        }
+    }
+}
+
+/// Computes what the import will hold at once, in bytes, and refuses what is more than allowed, before any of it is taken.
+pub(super) fn check_memory(container: &mut Container, copies: &Copies, wanted: Wanted) -> Result<u64> {
+    let document = &container.document;
+    // Buffers stay in memory once they are loaded
+    let fixed = document.buffers.iter().map(|buffer| buffer.byte_length).fold(0, u64::saturating_add);
+    let (mut largest, mut name) = (0_u64, String::new());
+    for &mesh in copies.keys() {
+        for (index, primitive) in document.meshes[mesh].primitives.iter().enumerate() {
+            let count =
+                |accessor: Option<usize>| accessor.and_then(|a| document.accessors.get(a)).map(|a| a.count);
+            let vertices = count(primitive.attributes.get("POSITION").copied()).unwrap_or(0);
+            let corners = count(primitive.indices).unwrap_or(vertices);
+            let mode = primitive.mode.unwrap_or(4);
+            // Beside the mesh stand its indices or its positions, and texture coordinates and colours
+            let own =
+                mesh_bytes(vertices, corners, mode).saturating_add(vertices.max(corners).saturating_mul(24));
+            let leaves = if wanted.leaves && primitive.material.is_some() { leaves::BYTES } else { 0 };
+            if own.saturating_add(leaves) > largest {
+                (largest, name) = (own.saturating_add(leaves), format!("mesh {mesh}, primitive {index}"));
+            }
+        }
+    }
+    let need = container.budget.held().saturating_add(fixed).saturating_add(largest);
+    container.budget.check(need, &name)?;
+    Ok(need)
+}
+
+/// Bytes of a primitive's mesh. Strips and fans have a face for each index.
+fn mesh_bytes(vertices: u64, corners: u64, mode: u32) -> u64 {
+    let faces = if mode == 4 { corners / 3 } else { corners };
+    Mesh::bytes(vertices, faces.saturating_mul(3), faces)
 }
 
 /// What is wanted of a primitive.
@@ -89,9 +154,7 @@ fn read_attributes(
     }
     let vertices = container.count(positions)?;
     let corners = indices.map_or(Ok(vertices), |indices| container.count(indices))?;
-    // Strips and fans have a face for each index
-    let faces = if mode == 4 { corners / 3 } else { corners };
-    let bytes = Mesh::bytes(vertices, faces.saturating_mul(3), faces);
+    let bytes = mesh_bytes(vertices, corners, mode);
     container.budget.take(bytes, "the mesh")?;
     let mut mesh = Mesh { single_precision: true, ..Mesh::default() };
     let (values, _) = container.floats(positions, &[3])?;
@@ -113,7 +176,7 @@ fn read_attributes(
     if let Some(((values, components), accessor)) = &colors {
         same_count(*accessor, values.len() / components, &mesh)?;
     }
-    let uvs = match surface.texture.as_ref().map(|texture| format!("TEXCOORD_{}", texture.set)) {
+    let mut uvs = match surface.texture.as_ref().map(|(set, _)| format!("TEXCOORD_{set}")) {
         Some(name) => match attributes.get(&name) {
             Some(&accessor) => {
                 let (values, _) = container.floats(accessor, &[2])?;
@@ -128,23 +191,27 @@ fn read_attributes(
         None => None,
     };
     let mut colors = colors.map(|(colors, _)| colors);
-    let see_through = surface.texture.is_some() && surface.alpha != AlphaMode::Opaque;
     if wanted.leaves
-        && see_through
+        && surface.alpha != AlphaMode::Opaque
         && mesh.faces.iter().all(|face| face.arity == 3)
-        && let Some(uvs) = uvs
+        && let Some((_, texture)) = &surface.texture
+        && let Some(uvs) = uvs.take()
     {
         container.budget.take(leaves::BYTES, "cutting faces to texels")?;
-        let leaves = Leaves { surface, uvs, colors, with_albedo: wanted.albedo };
+        if wanted.albedo {
+            color(&mut mesh, surface.factor, |_| [1.0; 3], |v| vertex_color(colors.as_ref(), v));
+        }
+        let (alpha, factor) = (surface.alpha, surface.factor[3]);
+        let leaves = Cut { texture: texture.clone(), alpha, factor, uvs, colors };
         return Ok(Some(Read { mesh, bytes: bytes + leaves::BYTES, leaves: Some(leaves) }));
     }
-    paint(&mut mesh, &surface, images, uvs.as_deref(), |v| vertex_color(colors.as_ref(), v), wanted.albedo);
+    paint(&mut mesh, &surface, uvs.as_deref(), |v| vertex_color(colors.as_ref(), v), wanted.albedo);
     release(container, colors.take(), uvs);
     Ok(Some(Read { mesh, bytes, leaves: None }))
 }
 
 /// Gives back what the colours and the texture coordinates of vertices take.
-pub(super) fn release(container: &mut Container, colors: Option<(Vec<f32>, usize)>, uvs: Option<Vec<f32>>) {
+fn release(container: &mut Container, colors: Option<(Vec<f32>, usize)>, uvs: Option<Vec<f32>>) {
     if let Some((values, _)) = colors {
         container.release(values);
     }
@@ -154,7 +221,7 @@ pub(super) fn release(container: &mut Container, colors: Option<(Vec<f32>, usize
 }
 
 /// The colour of a vertex, white where it has none.
-pub(super) fn vertex_color(colors: Option<&(Vec<f32>, usize)>, vertex: usize) -> [f32; 4] {
+fn vertex_color(colors: Option<&(Vec<f32>, usize)>, vertex: usize) -> [f32; 4] {
     match colors {
         Some((values, components)) => {
             std::array::from_fn(|i| if i < *components { values[vertex * components + i] } else { 1.0 })
@@ -255,15 +322,14 @@ fn surface(
 fn paint(
     mesh: &mut Mesh,
     surface: &Surface,
-    images: &Images,
     uvs: Option<&[f32]>,
     vertex_color: impl Fn(usize) -> [f32; 4],
     with_albedo: bool,
 ) {
     let factor = surface.factor;
     let mut averager = match (&surface.texture, uvs) {
-        (Some(texture), Some(uvs)) => {
-            let averager = Averager::new(images, texture, surface.alpha, factor[3], mesh.faces.len());
+        (Some((_, texture)), Some(uvs)) => {
+            let averager = Averager::new(texture, surface.alpha, factor[3], mesh.faces.len());
             Some((averager, uvs))
         }
         _ => None,
@@ -299,17 +365,26 @@ fn paint(
     }
     mesh.faces = faces;
     if with_albedo {
-        mesh.colors = (0..mesh.positions.len())
-            .map(|vertex| {
-                let texture = match sums.get(vertex) {
-                    Some(&[r, g, b, weight]) if weight > 0.0 => [r / weight, g / weight, b / weight],
-                    _ => [1.0; 3],
-                };
-                let own = vertex_color(vertex);
-                std::array::from_fn(|i| srgb::unit_byte(factor[i] * texture[i] * own[i]))
-            })
-            .collect();
+        let texture = |vertex: usize| match sums.get(vertex) {
+            Some(&[r, g, b, weight]) if weight > 0.0 => [r / weight, g / weight, b / weight],
+            _ => [1.0; 3],
+        };
+        color(mesh, factor, texture, vertex_color);
     }
+}
+
+/// Gives vertices their albedo: factor, times texture, times their own colour.
+fn color(
+    mesh: &mut Mesh,
+    factor: [f32; 4],
+    texture: impl Fn(usize) -> [f32; 3],
+    vertex_color: impl Fn(usize) -> [f32; 4],
+) {
+    let albedo = |vertex| {
+        let (texture, own) = (texture(vertex), vertex_color(vertex));
+        std::array::from_fn(|i| srgb::unit_byte(factor[i] * texture[i] * own[i]))
+    };
+    mesh.colors = (0..mesh.positions.len()).map(albedo).collect();
 }
 
 /// A weight in proportion to a triangle's area, which stays in single precision.

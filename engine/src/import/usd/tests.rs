@@ -43,7 +43,7 @@ fn read_text(text: &str) -> (Collect, ImportReport) {
 fn expand(path: &Path) -> (Schema, Vec<Microgrid>, Parts) {
     let folder = tempfile::tempdir().unwrap();
     let (parts, _) =
-        import_parts(path, &folder.path().join("a.mgs"), &ImportOptions::default(), &mut || Ok(())).unwrap();
+        import_parts(path, &folder.path().join("a.mgs"), &ImportOptions::default(), &mut |_| Ok(())).unwrap();
     let mut stream: Box<dyn MicrogridStream> = parts.open().unwrap();
     let (mut grids, mut grid) = (Vec::new(), Microgrid::default());
     while stream.next(&mut grid).unwrap() {
