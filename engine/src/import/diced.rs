@@ -26,12 +26,13 @@ enum Surface<'a> {
     CatmullClark(Prepared<'a>),
 }
 
-/// Writes a copy of a mesh, diced. The mesh is not finished if it has a surface.
+/// Writes a copy of a mesh, diced by a rate. Positions are rounded to a step: that of the mesh, if none is given. The mesh is not
+/// finished if it has a surface.
 pub(super) fn emit(
     emitter: &mut Emitter<'_>,
     mut mesh: Mesh,
     placement: &Placement,
-    rate: &Rate,
+    (rate, step): (&Rate, Option<f64>),
     (first_id, radius): (u32, f32),
     report: &mut ImportReport,
 ) -> Result<()> {
@@ -53,8 +54,8 @@ pub(super) fn emit(
         None => Surface::Polygons(polygons(&mesh, &columns)),
     };
     let chunks = chunks(&mesh, &surface, rate)?;
-    let size = mesh.bounds().size().max_element();
-    let step = emit::power_of_two(emit::resolution(size));
+    let own_step = || emit::power_of_two(emit::resolution(mesh.bounds().size().max_element()));
+    let step = step.unwrap_or_else(own_step);
     for batch in chunks.chunks(2 * rayon::current_num_threads()) {
         let diced: Vec<Mesh> = (batch.par_iter())
             .map(|faces| {
@@ -82,6 +83,10 @@ fn place(mesh: &mut Mesh, placement: &Placement) {
     mesh.normals.iter_mut().for_each(|normal| *normal = placement.normal(*normal));
     mesh.radii.iter_mut().for_each(|radius| *radius *= placement.scale as f32);
     mesh.single_precision = false;
+    if !placement.is_identity() {
+        // Where space is stretched, faces weigh differently
+        mesh.smooth.clear();
+    }
     if placement.mirrored {
         for face in &mesh.faces {
             let range = face.start as usize + 1..(face.start + face.arity) as usize;

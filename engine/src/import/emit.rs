@@ -103,6 +103,11 @@ impl Placement {
         })
     }
 
+    /// Whether it leaves a mesh where it is.
+    pub fn is_identity(&self) -> bool {
+        self.identity
+    }
+
     /// Where a point stands.
     pub fn point(&self, point: DVec3) -> DVec3 {
         if self.identity { point } else { self.world_from_mesh.transform_point3(point) }
@@ -183,7 +188,7 @@ impl<'a> Emitter<'a> {
         report: &mut ImportReport,
     ) -> Result<()> {
         match rate {
-            Some(rate) => super::diced::emit(self, mesh.clone(), placement, rate, ids, report),
+            Some(rate) => super::diced::emit(self, mesh.clone(), placement, (rate, None), ids, report),
             None => self.emit(mesh, clusters, placement, ids, report),
         }
     }

@@ -59,7 +59,7 @@ pub(super) struct Mesh {
     pub faces: Vec<Face>,
     /// Linear albedo of materials.
     pub palette: Vec<[u8; 3]>,
-    /// Area-weighted normal per position, from [`finish`](Self::finish); empty when no corner needs one.
+    /// Area-weighted normal per position, from [`finish`](Self::finish) unless it is there already; empty when no corner needs one.
     pub smooth: Vec<Vec3>,
     /// The surface that the faces stand for, if not for themselves; only dicing heeds it.
     pub subdivision: Option<Subdivision>,
@@ -180,9 +180,22 @@ impl Mesh {
             || self.faces.iter().any(|face| face.opacity < 255)
     }
 
-    /// Drops faces that cannot be used, turns polygons of more than four corners into triangles, turns quads whose
-    /// diagonal v0-v2 lies outside, and computes the normals that are missing. Indices must be in range.
+    /// Makes faces usable, and computes the normals that are missing. Indices must be in range.
     pub fn finish(&mut self, report: &mut ImportReport) -> Result<()> {
+        self.keep_usable(report)?;
+        let without = |face: &Face| {
+            face.arity > 2
+                && (face.start..face.start + face.arity).any(|c| self.normal_index(c as usize) == NO_NORMAL)
+        };
+        if self.smooth.is_empty() && self.faces.iter().any(without) {
+            self.compute_normals();
+        }
+        Ok(())
+    }
+
+    /// Drops faces that cannot be used, turns polygons of more than four corners into triangles, and turns quads whose
+    /// diagonal v0-v2 lies outside.
+    pub fn keep_usable(&mut self, report: &mut ImportReport) -> Result<()> {
         let faces = std::mem::take(&mut self.faces);
         let mut kept = Vec::with_capacity(faces.len());
         let mut scratch = polygon::Scratch::default();
@@ -194,13 +207,6 @@ impl Mesh {
             }
         }
         self.faces = kept;
-        let without = |face: &Face| {
-            face.arity > 2
-                && (face.start..face.start + face.arity).any(|c| self.normal_index(c as usize) == NO_NORMAL)
-        };
-        if self.faces.iter().any(without) {
-            self.compute_normals();
-        }
         Ok(())
     }
 

@@ -12,6 +12,7 @@ mod cut;
 mod diced;
 mod emit;
 mod gltf;
+mod large;
 mod leaves;
 mod lines;
 mod mesh;
@@ -94,8 +95,17 @@ pub struct ImportOptions {
     pub texels: Option<f64>,
     /// Micropolygons that the leaves of a file may become.
     pub leaves_max: u64,
+    /// Where meshes larger than memory wait on disk; none is the system's folder for temporary files.
+    pub scratch: Option<std::path::PathBuf>,
     /// Seconds that may pass until a USD file yields its next prim: a broken one may take for ever.
     pub patience_seconds: u64,
+}
+
+impl ImportOptions {
+    /// Where meshes larger than memory wait on disk.
+    fn scratch_folder(&self) -> std::path::PathBuf {
+        self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
 }
 
 impl Default for ImportOptions {
@@ -108,6 +118,7 @@ impl Default for ImportOptions {
             dice: None,
             texels: None,
             leaves_max: 1 << 28,
+            scratch: None,
             patience_seconds: 300,
         }
     }

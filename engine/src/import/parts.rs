@@ -107,7 +107,10 @@ pub fn import_parts(
 ) -> Result<(Parts, ImportReport)> {
     let mut sink =
         PartsSink { target, watch, begun: None, writer: None, next: None, parts: Parts::default() };
-    let outcome = import(path, options, &mut sink).and_then(|report| {
+    let beside = target.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let scratch = options.scratch.clone().or_else(|| Some(beside.to_path_buf()));
+    let options = ImportOptions { scratch, ..options.clone() };
+    let outcome = import(path, &options, &mut sink).and_then(|report| {
         sink.finish_part()?;
         if !sink.parts.parts.is_empty() {
             return Ok(report);

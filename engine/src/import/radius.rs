@@ -17,27 +17,44 @@ const NEIGHBOUR: usize = 4;
 ///
 /// Taken from neighbours, not from extent and count: clouds from photographs have far outliers and empty space.
 pub(super) fn default_radius(mesh: &Mesh, clusters: &Clusters, meters_per_unit: f64) -> f32 {
-    let diagonal = mesh.bounds().size().length();
-    let points = mesh.faces.iter().filter(|face| face.arity == 1).count();
-    let lines = mesh.faces.iter().filter(|face| face.arity == 2).count();
-    let radius = if lines > points {
-        0.001 * diagonal
-    } else {
-        spacing(mesh, clusters).map_or(0.01 * diagonal, |spacing| (0.5 * spacing).min(0.01 * diagonal))
+    let count = |arity| mesh.faces.iter().filter(|face| face.arity == arity).count() as u64;
+    let thin = [count(1), count(2)];
+    choose(mesh.bounds().size().length(), thin, spacings(mesh, clusters), meters_per_unit)
+}
+
+/// The radius for so many points and lines in a box of this diagonal, by distances of points to their neighbours.
+pub(super) fn choose(
+    diagonal: f64,
+    [points, lines]: [u64; 2],
+    mut spacings: Vec<f64>,
+    meters_per_unit: f64,
+) -> f32 {
+    let middle = spacings.len() / 2;
+    let radius = match spacings.is_empty() {
+        _ if lines > points => 0.001 * diagonal,
+        true => 0.01 * diagonal,
+        false => {
+            let spacing = spacings.select_nth_unstable_by(middle, f64::total_cmp).1.sqrt();
+            (0.5 * spacing).min(0.01 * diagonal)
+        }
     };
     if radius > 0.0 { radius as f32 } else { (0.001 / meters_per_unit) as f32 }
 }
 
-/// Warns that points or lines got a radius that nobody gave.
+/// Warns that points or lines of a mesh got a radius that nobody gave.
 pub(super) fn warn_radius(mesh: &Mesh, radius: f32, report: &mut ImportReport) {
     if mesh.radii.is_empty() && mesh.has_radii() {
-        report.warn(format!("points or lines without a radius were given `{radius}`"));
+        warn(radius, report);
     }
 }
 
-/// The median distance from a point to its fourth neighbour in the same cluster; none where no cluster has five
-/// places.
-fn spacing(mesh: &Mesh, clusters: &Clusters) -> Option<f64> {
+/// Warns of a radius that nobody gave.
+pub(super) fn warn(radius: f32, report: &mut ImportReport) {
+    report.warn(format!("points or lines without a radius were given `{radius}`"));
+}
+
+/// The squared distances from points to their fourth neighbour in the same cluster; none where no cluster has five places.
+pub(super) fn spacings(mesh: &Mesh, clusters: &Clusters) -> Vec<f64> {
     let step = clusters.iter().count().div_ceil(CLUSTERS_MAX).max(1);
     let (mut places, mut nearest, mut found) = (Vec::new(), Vec::new(), Vec::new());
     for cluster in clusters.iter().step_by(step) {
@@ -52,8 +69,7 @@ fn spacing(mesh: &Mesh, clusters: &Clusters) -> Option<f64> {
             }
         }
     }
-    let middle = found.len() / 2;
-    (!found.is_empty()).then(|| found.select_nth_unstable_by(middle, f64::total_cmp).1.sqrt())
+    found
 }
 
 #[cfg(test)]

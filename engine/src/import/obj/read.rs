@@ -1,4 +1,4 @@
-//! Reads the text of an OBJ file into a mesh: once to count what it needs, once to take it.
+//! Reads the text of an OBJ file into a mesh.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::{DVec3, Vec3};
 
 use super::mtl::{self, Material, rest_of};
-use crate::import::budget::Budget;
+use crate::import::large::Elements;
 use crate::import::lines::{self, LineReader};
 use crate::import::mesh::{Face, Mesh, NO_NORMAL};
 use crate::import::{ImportOptions, ImportReport, confine};
@@ -37,61 +37,22 @@ const IGNORED: [&[u8]; 12] = [
 /// Albedo of materials that have none.
 const ALBEDO_DEFAULT: [u8; 3] = [128; 3];
 
+/// Bytes of the names of objects at most.
+const NAME_BYTES_MAX: u64 = 32 << 20;
+
 /// Reads the file at `path`.
-pub(super) fn read(path: &Path, options: &ImportOptions, report: &mut ImportReport) -> Result<Mesh> {
-    let counts = count(path)?;
-    let mut budget = Budget::new(options.memory_bytes, path);
-    let bytes = Mesh::bytes(counts.vertices + counts.normals / 2, counts.corners, counts.faces);
-    budget.take(bytes.saturating_add(counts.name_bytes), "the mesh")?;
-    if u32::try_from(counts.vertices.max(counts.normals)).is_err() {
-        return Err(Error::new(ErrorKind::Limit, "more than 4,294,967,295 vertices or normals"));
-    }
+pub(super) fn read<'a>(
+    path: &Path,
+    options: &'a ImportOptions,
+    report: &mut ImportReport,
+) -> Result<Elements<'a>> {
     let mut reader = LineReader::open(path)?;
-    let mut state = State::new(path, counts.normals > 0);
-    state.mesh.positions.reserve_exact(counts.vertices as usize);
-    state.mesh.normals.reserve_exact(counts.normals as usize);
+    let mut state = State::new(path, options);
     while reader.advance(true)? {
         state.statement(&reader, report)?;
+        state.elements.relieve()?;
     }
     state.finish(report)
-}
-
-/// What the arrays of a mesh will hold, at most.
-#[derive(Debug, Default)]
-struct Counts {
-    vertices: u64,
-    normals: u64,
-    corners: u64,
-    faces: u64,
-    name_bytes: u64,
-}
-
-fn count(path: &Path) -> Result<Counts> {
-    let mut reader = LineReader::open(path)?;
-    let mut counts = Counts::default();
-    while reader.advance(true)? {
-        let mut words = lines::tokens(reader.line());
-        match words.next() {
-            Some(b"v") => counts.vertices += 1,
-            Some(b"vn") => counts.normals += 1,
-            Some(b"f") => {
-                // A polygon of n corners becomes n - 2 triangles beside itself
-                let n = words.count() as u64;
-                let triangles = n.saturating_sub(2);
-                counts.faces += if n > 4 { 1 + triangles } else { 1 };
-                counts.corners += if n > 4 { n + 3 * triangles } else { n };
-            }
-            Some(b"l" | b"p") => {
-                let n = words.count() as u64;
-                counts.faces += n;
-                counts.corners += 2 * n;
-            }
-            // A name in a hash table costs about 64 bytes besides itself
-            Some(b"o" | b"g") => counts.name_bytes += 2 * reader.line().len() as u64 + 64,
-            _ => {}
-        }
-    }
-    Ok(counts)
 }
 
 /// The furthest index that was ahead of what it refers to, and where it stood.
@@ -102,14 +63,15 @@ struct Ahead {
     column: u64,
 }
 
-struct State {
+struct State<'a> {
     path: PathBuf,
-    mesh: Mesh,
-    has_normals: bool,
+    elements: Elements<'a>,
     /// Object and group names; together they name what gets an `id`.
     object: Vec<u8>,
     group: Vec<u8>,
     ids: HashMap<Vec<u8>, u32>,
+    /// Bytes of all names in `ids`.
+    name_bytes: u64,
     id: Option<u32>,
     materials: Vec<Material>,
     /// Material and opacity of the faces that follow; 0 is no material.
@@ -121,15 +83,17 @@ struct State {
     corner_normals: Vec<u32>,
 }
 
-impl State {
-    fn new(path: &Path, has_normals: bool) -> Self {
+impl<'a> State<'a> {
+    fn new(path: &Path, options: &'a ImportOptions) -> Self {
+        let mut elements = Elements::new(path, options);
+        elements.mesh.single_precision = true;
         Self {
             path: path.to_path_buf(),
-            mesh: Mesh { single_precision: true, ..Mesh::default() },
-            has_normals,
+            elements,
             object: Vec::new(),
             group: Vec::new(),
             ids: HashMap::new(),
+            name_bytes: 0,
             id: None,
             materials: Vec::new(),
             material: 0,
@@ -184,39 +148,40 @@ impl State {
     }
 
     /// `v x y z [w]` or `v x y z [w] r g b`.
-    fn vertex<'a>(
+    fn vertex<'b>(
         &mut self,
         reader: &LineReader,
         keyword: &[u8],
-        words: impl Iterator<Item = &'a [u8]>,
+        words: impl Iterator<Item = &'b [u8]>,
     ) -> Result<()> {
         let (values, count) = numbers::<7>(reader, keyword, words)?;
         let position = DVec3::new(values[0], values[1], values[2]);
-        self.mesh.single_precision &= position.as_vec3().as_dvec3() == position;
+        let mesh = &mut self.elements.mesh;
+        mesh.single_precision &= position.as_vec3().as_dvec3() == position;
         let color = match count {
             6 => Some([values[3], values[4], values[5]]),
             7 => Some([values[4], values[5], values[6]]),
             _ => None,
         };
-        if color.is_some() && self.mesh.colors.is_empty() {
-            self.mesh.colors.resize(self.mesh.positions.len(), ALBEDO_DEFAULT);
+        if color.is_some() && mesh.colors.is_empty() {
+            mesh.colors.resize(mesh.positions.len(), ALBEDO_DEFAULT);
         }
-        self.mesh.positions.push(position);
-        if color.is_some() || !self.mesh.colors.is_empty() {
+        mesh.positions.push(position);
+        if color.is_some() || !mesh.colors.is_empty() {
             let byte = |value: f64| crate::import::srgb::unit_byte(value as f32);
-            self.mesh.colors.push(color.map_or(ALBEDO_DEFAULT, |color| color.map(byte)));
+            mesh.colors.push(color.map_or(ALBEDO_DEFAULT, |color| color.map(byte)));
         }
         Ok(())
     }
 
-    fn normal<'a>(
+    fn normal<'b>(
         &mut self,
         reader: &LineReader,
         keyword: &[u8],
-        words: impl Iterator<Item = &'a [u8]>,
+        words: impl Iterator<Item = &'b [u8]>,
     ) -> Result<()> {
         let (values, _) = numbers::<3>(reader, keyword, words)?;
-        self.mesh.normals.push(Vec3::from_array(values.map(|value| value as f32)));
+        self.elements.mesh.normals.push(Vec3::from_array(values.map(|value| value as f32)));
         Ok(())
     }
 
@@ -226,7 +191,7 @@ impl State {
         let position = parts.next().unwrap_or_default();
         let texture = parts.next().unwrap_or_default();
         let normal = parts.next().unwrap_or_default();
-        let count = self.mesh.positions.len();
+        let count = self.elements.positions();
         let position = index(reader, word, position, count, "vertex", &mut self.positions_ahead)?;
         if !texture.is_empty() {
             integer(reader, word, texture)?;
@@ -234,7 +199,7 @@ impl State {
         let normal = match normal {
             b"" => NO_NORMAL,
             _ => {
-                let count = self.mesh.normals.len();
+                let count = self.elements.normals();
                 index(reader, word, normal, count, "normal", &mut self.normals_ahead)?
             }
         };
@@ -256,12 +221,11 @@ impl State {
             let few = if arity == 2 { "lines of one point" } else { "faces of fewer than three corners" };
             report.skip(few, u64::from(arity > 1));
         } else {
-            let face = self.face();
+            let face = self.face()?;
             for start in 0..=corners.len() - arity {
-                self.mesh.push_face(face, &corners[start..start + arity], report)?;
-                if self.has_normals {
-                    self.mesh.corner_normals.extend_from_slice(&normals[start..start + arity]);
-                }
+                let mesh = &mut self.elements.mesh;
+                mesh.push_face(face, &corners[start..start + arity], report)?;
+                mesh.corner_normals.extend_from_slice(&normals[start..start + arity]);
             }
         }
         (self.corners, self.corner_normals) = (corners, normals);
@@ -269,13 +233,23 @@ impl State {
     }
 
     /// A face as the statements before it say.
-    fn face(&mut self) -> Face {
-        let object = *self.id.get_or_insert_with(|| {
-            let name = [self.object.as_slice(), &self.group].join(&0);
-            let next = self.ids.len() as u32;
-            *self.ids.entry(name).or_insert(next)
-        });
-        Face { start: 0, arity: 0, material: self.material, object, opacity: self.opacity }
+    fn face(&mut self) -> Result<Face> {
+        let object = match self.id {
+            Some(id) => id,
+            None => {
+                let name = [self.object.as_slice(), &self.group].join(&0);
+                let (next, bytes) = (self.ids.len() as u32, name.len() as u64);
+                let id = *self.ids.entry(name).or_insert(next);
+                // A name in a hash table costs about 64 bytes besides itself
+                self.name_bytes += if id == next { bytes + 64 } else { 0 };
+                if self.name_bytes > NAME_BYTES_MAX {
+                    let message = format!("names of objects that take more than {NAME_BYTES_MAX} bytes");
+                    return Err(Error::new(ErrorKind::Limit, message).hint("cut the file into parts"));
+                }
+                *self.id.insert(id)
+            }
+        };
+        Ok(Face { start: 0, arity: 0, material: self.material, object, opacity: self.opacity })
     }
 
     fn use_material(&mut self, name: &[u8], report: &mut ImportReport) {
@@ -320,28 +294,33 @@ impl State {
     }
 
     /// Checks the indices that were ahead, and hands over the mesh.
-    fn finish(mut self, report: &mut ImportReport) -> Result<Mesh> {
-        let positions = self.mesh.positions.len();
-        if let Some(ahead) = self.positions_ahead.filter(|ahead| ahead.index >= positions as u64) {
+    fn finish(mut self, report: &mut ImportReport) -> Result<Elements<'a>> {
+        let positions = self.elements.positions();
+        if let Some(ahead) = self.positions_ahead.filter(|ahead| ahead.index >= positions) {
             return Err(Error::invalid(format!("vertex `{}` of {positions} vertices", ahead.index + 1))
                 .at_text(&self.path, ahead.line, ahead.column));
         }
-        let normals = self.mesh.normals.len();
-        if let Some(ahead) = self.normals_ahead.filter(|ahead| ahead.index >= normals as u64) {
+        let normals = self.elements.normals();
+        if let Some(ahead) = self.normals_ahead.filter(|ahead| ahead.index >= normals) {
             // Files of bare topology refer to normals that nobody wrote
             let (line, column, index) = (ahead.line, ahead.column, ahead.index + 1);
             report.warn(format!(
                 "normal `{index}` of {normals} (line {line}, column {column}): normals that are not there are computed"
             ));
-            let is_missing = |normal: &&mut u32| **normal as usize >= normals;
-            self.mesh.corner_normals.iter_mut().filter(is_missing).for_each(|normal| *normal = NO_NORMAL);
+            let is_missing = |normal: &&mut u32| u64::from(**normal) >= normals;
+            self.elements
+                .mesh
+                .corner_normals
+                .iter_mut()
+                .filter(is_missing)
+                .for_each(|normal| *normal = NO_NORMAL);
         }
         if self.materials.iter().any(|material| material.albedo.is_some()) {
             let albedos = self.materials.iter().map(|material| material.albedo.unwrap_or(ALBEDO_DEFAULT));
-            self.mesh.palette = std::iter::once(ALBEDO_DEFAULT).chain(albedos).collect();
+            self.elements.mesh.palette = std::iter::once(ALBEDO_DEFAULT).chain(albedos).collect();
         }
-        report.source.vertices = positions as u64;
-        Ok(self.mesh)
+        report.source.vertices = positions;
+        Ok(self.elements)
     }
 }
 
@@ -400,7 +379,7 @@ fn index(
     reader: &LineReader,
     word: &[u8],
     digits: &[u8],
-    count: usize,
+    count: u64,
     what: &str,
     ahead: &mut Option<Ahead>,
 ) -> Result<u32> {
@@ -410,7 +389,7 @@ fn index(
         let message = format!("{what} `{value}` of the {count} so far, which count from 1");
         return Err(reader.error(ErrorKind::Invalid, word, message));
     }
-    if absolute as usize >= count && ahead.is_none_or(|known| known.index < absolute as u64) {
+    if absolute as u64 >= count && ahead.is_none_or(|known| known.index < absolute as u64) {
         let column = (word.as_ptr() as usize - reader.line().as_ptr() as usize) as u64 + 1;
         *ahead = Some(Ahead { index: absolute as u64, line: reader.number, column });
     }

@@ -10,10 +10,9 @@ use glam::{DVec3, Vec3};
 
 use self::body::Body;
 use self::header::{Element, Property, Scalar};
-use super::budget::Budget;
-use super::emit::{self, Carried, Emitter, Placement};
+use super::large::Elements;
 use super::mesh::{Face, Mesh};
-use super::{GridSink, ImportOptions, ImportReport, cut, radius, srgb};
+use super::{GridSink, ImportOptions, ImportReport, emit, srgb};
 use crate::{Error, ErrorKind, Result};
 
 /// Corners of a polygon at most.
@@ -25,18 +24,13 @@ const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 2
 /// Imports a PLY file.
 pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {
     let mut report = ImportReport::default();
-    let mut mesh = read(path, options, &mut report)?;
-    mesh.finish(&mut report)?;
-    let clusters = cut::cut(&mesh);
-    let radius = radius::default_radius(&mesh, &clusters, options.meters_per_unit);
-    radius::warn_radius(&mesh, radius, &mut report);
-    let mut emitter = Emitter::new(sink, Carried::by(&mesh), options)?;
-    let rate = options.dice.as_ref();
-    emitter.emit_diced(&mesh, &clusters, &Placement::HERE, rate, (0, radius), &mut report)?;
+    let mut elements = Elements::new(path, options);
+    read(path, &mut elements, &mut report)?;
+    elements.emit(sink, &mut report)?;
     Ok(report)
 }
 
-fn read(path: &Path, options: &ImportOptions, report: &mut ImportReport) -> Result<Mesh> {
+fn read(path: &Path, elements: &mut Elements<'_>, report: &mut ImportReport) -> Result<()> {
     let mut file = File::open(path).map_err(|e| Error::io("open the file", path, e))?;
     let header = header::read(&mut file, path)?;
     let mut body = Body::open(file, &header, path)?;
@@ -49,30 +43,28 @@ fn read(path: &Path, options: &ImportOptions, report: &mut ImportReport) -> Resu
             .hint("convert them to faces with another program"));
     }
     let is_cloud = faces == 0 && edges == 0;
-    let faces = if is_cloud { vertices } else { faces.saturating_add(edges) };
-    let mut budget = Budget::new(options.memory_bytes, path);
-    let corners = if is_cloud { vertices } else { faces.saturating_mul(3) };
-    budget.take(Mesh::bytes(vertices, corners, faces), "the mesh")?;
     if u32::try_from(vertices).is_err() {
         return Err(Error::new(
             ErrorKind::Limit,
             format!("{vertices} vertices, at most 4,294,967,295 are possible"),
         ));
     }
-    let mut mesh = Mesh::default();
     for element in &header.elements {
         match element.name.as_str() {
-            "vertex" => read_vertices(&mut body, element, &mut mesh)?,
-            "face" => read_faces(&mut body, element, vertices, &mut mesh, &mut budget, report)?,
-            "edge" => read_edges(&mut body, element, vertices, &mut mesh, report)?,
+            "vertex" => read_vertices(&mut body, element, elements)?,
+            "face" => read_faces(&mut body, element, vertices, elements, report)?,
+            "edge" => read_edges(&mut body, element, vertices, elements, report)?,
             _ => body.skip(element)?,
         }
     }
     if is_cloud {
-        (0..mesh.positions.len() as u32).try_for_each(|point| mesh.push_face(FACE, &[point], report))?;
+        for point in 0..vertices as u32 {
+            elements.mesh.push_face(FACE, &[point], report)?;
+            elements.relieve()?;
+        }
     }
     report.source.vertices = vertices;
-    Ok(mesh)
+    Ok(())
 }
 
 /// What a property of a vertex means.
@@ -110,7 +102,7 @@ impl Role {
     }
 }
 
-fn read_vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<()> {
+fn read_vertices(body: &mut Body, element: &Element, elements: &mut Elements<'_>) -> Result<()> {
     let roles: Vec<(&Property, Role)> = element.properties.iter().map(|p| (p, Role::of(p))).collect();
     let has = |role: Role| roles.iter().any(|&(_, known)| known == role);
     if let Some(axis) = (0..3).find(|&axis| !has(Role::Position(axis))) {
@@ -120,9 +112,10 @@ fn read_vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<
     let colors = (0..3).all(|channel| has(Role::Color(channel)));
     let opacities = has(Role::Alpha);
     let radii = has(Role::Radius) || has(Role::Diameter);
-    mesh.single_precision = roles
+    let single_precision = roles
         .iter()
         .all(|(property, role)| !matches!(role, Role::Position(_)) || property.scalar == Scalar::F32);
+    elements.mesh.single_precision = single_precision;
     for _ in 0..element.count {
         body.begin_row()?;
         let (mut position, mut normal, mut color) = (DVec3::ZERO, Vec3::ZERO, [0; 3]);
@@ -137,7 +130,7 @@ fn read_vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<
             let value = body.value(property.scalar)?;
             match role {
                 // Text of a single precision file may hold more digits than the type it claims
-                Role::Position(axis) if mesh.single_precision => position[axis] = f64::from(value as f32),
+                Role::Position(axis) if single_precision => position[axis] = f64::from(value as f32),
                 Role::Position(axis) => position[axis] = value,
                 Role::Normal(axis) => normal[axis] = value as f32,
                 Role::Color(channel) => color[channel] = color_byte(value, property.scalar),
@@ -150,6 +143,7 @@ fn read_vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<
                 Role::Other => {}
             }
         }
+        let mesh: &mut Mesh = &mut elements.mesh;
         mesh.positions.push(position);
         if normals {
             mesh.normals.push(normal);
@@ -163,6 +157,7 @@ fn read_vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<
         if radii {
             mesh.radii.push(radius);
         }
+        elements.relieve()?;
     }
     Ok(())
 }
@@ -180,8 +175,7 @@ fn read_faces(
     body: &mut Body,
     element: &Element,
     vertices: u64,
-    mesh: &mut Mesh,
-    budget: &mut Budget,
+    elements: &mut Elements<'_>,
     report: &mut ImportReport,
 ) -> Result<()> {
     let is_indices = |p: &Property| {
@@ -210,27 +204,11 @@ fn read_faces(
                 corners.push(index(body, property.scalar, vertices)?);
             }
         }
-        push_polygon(mesh, &corners, budget, report)?;
-    }
-    Ok(())
-}
-
-/// Adds a face of any number of corners.
-fn push_polygon(
-    mesh: &mut Mesh,
-    corners: &[u32],
-    budget: &mut Budget,
-    report: &mut ImportReport,
-) -> Result<()> {
-    match corners.len() {
-        0..3 => report.skip("faces of fewer than three corners", 1),
-        3 => mesh.push_face(FACE, corners, report)?,
-        n => {
-            // What the mesh was budgeted with is three corners a face
-            let triangles = n as u64 - 2;
-            budget.take(Mesh::bytes(0, n as u64 + 3 * triangles, triangles), "the mesh")?;
-            mesh.push_face(FACE, corners, report)?;
+        match corners.len() {
+            0..3 => report.skip("faces of fewer than three corners", 1),
+            _ => elements.mesh.push_face(FACE, &corners, report)?,
         }
+        elements.relieve()?;
     }
     Ok(())
 }
@@ -239,7 +217,7 @@ fn read_edges(
     body: &mut Body,
     element: &Element,
     vertices: u64,
-    mesh: &mut Mesh,
+    elements: &mut Elements<'_>,
     report: &mut ImportReport,
 ) -> Result<()> {
     let find = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
@@ -260,7 +238,8 @@ fn read_edges(
                 body.value(property.scalar)?;
             }
         }
-        mesh.push_face(FACE, &ends, report)?;
+        elements.mesh.push_face(FACE, &ends, report)?;
+        elements.relieve()?;
     }
     Ok(())
 }
