@@ -210,6 +210,26 @@ impl Mesh {
         Ok(())
     }
 
+    /// Parts quads along their diagonal v0-v2.
+    pub fn split_quads(&mut self) {
+        for face in std::mem::take(&mut self.faces) {
+            if face.arity != 4 {
+                self.faces.push(face);
+                continue;
+            }
+            for order in [[0, 1, 2], [0, 2, 3]] {
+                let start = self.corners.len() as u32;
+                let sources = order.map(|i| face.start as usize + i);
+                for parallel in [&mut self.corners, &mut self.corner_normals, &mut self.corner_variants] {
+                    if !parallel.is_empty() {
+                        parallel.extend(sources.map(|source| parallel[source]));
+                    }
+                }
+                self.faces.push(Face { start, arity: 3, ..face });
+            }
+        }
+    }
+
     /// Says why a face cannot be used; a quad may become a triangle, or start at another corner.
     fn check(&mut self, face: &mut Face) -> Result<(), &'static str> {
         let mut points = [DVec3::ZERO; 4];

@@ -48,7 +48,8 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
                 Some(cut) => {
                     let corner = |corner| cut.corner(&read.mesh, corner);
                     let look = (&cut.texture, cut.alpha, cut.factor);
-                    let mut leaves = Leaves::new(&read.mesh, look, &corner, options);
+                    let mut leaves =
+                        Leaves::new(&read.mesh, look, &corner, (options.texels, options.dice.as_ref()));
                     for (id, placement) in places {
                         leaves.emit(&mut emitter, placement, *id, &mut report)?;
                     }
@@ -81,7 +82,8 @@ fn count_leaves(
             if let Some(cut) = &read.leaves {
                 let corner = |corner| cut.corner(&read.mesh, corner);
                 let look = (&cut.texture, cut.alpha, cut.factor);
-                let mut leaves = Leaves::new(&read.mesh, look, &corner, options);
+                let mut leaves =
+                    Leaves::new(&read.mesh, look, &corner, (options.texels, options.dice.as_ref()));
                 for (_, placement) in places {
                     count = count.saturating_add(leaves.count(placement)?);
                 }

@@ -1,11 +1,13 @@
 //! A primitive of a mesh becomes an indexed mesh, with albedo per vertex and opacity per face.
 
+use std::collections::BTreeSet;
+
 use glam::{DVec3, Vec2, Vec3};
 
 use super::container::{Container, missing, unsupported};
 use super::document::Primitive;
 use super::nodes::Copies;
-use super::texture::Images;
+use super::texture::{self, Images};
 use crate::import::emit::opacity_byte;
 use crate::import::leaves;
 use crate::import::leaves::texture::{AlphaMode, Averager, Texture, coverage};
@@ -85,7 +87,19 @@ pub(super) fn check_memory(container: &mut Container, copies: &Copies, wanted: W
     }
     let need = container.budget.held().saturating_add(fixed).saturating_add(largest);
     container.budget.check(need, &name)?;
-    Ok(need)
+
+    // The images that are looked at; those not in use are dropped for others
+    let primitives = copies.keys().flat_map(|&mesh| &document.meshes[mesh].primitives);
+    let materials: BTreeSet<usize> = primitives.filter_map(|primitive| primitive.material).collect();
+    let mut image = 0;
+    for material in materials {
+        let found = container.document.materials.get(material);
+        if let Some(info) = found.and_then(|material| material.base().base_color_texture) {
+            image = texture::need(container, &info).max(image);
+        }
+    }
+    container.budget.check(need.saturating_add(image), "the largest image")?;
+    Ok(need.saturating_add(image))
 }
 
 /// Bytes of a primitive's mesh. Strips and fans have a face for each index.

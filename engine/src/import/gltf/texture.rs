@@ -98,19 +98,33 @@ fn transform(info: &TextureInfo) -> (u32, Option<(Vec2, Vec2, Vec2)>) {
 }
 
 fn decode(container: &mut Container, index: usize) -> Result<Image> {
+    let left = container.budget.left();
+    with_bytes(container, index, |bytes| Image::decode(bytes, left))
+}
+
+/// What decoding a texture's image takes at its peak, in bytes; none for one that cannot be read.
+pub(super) fn need(container: &mut Container, info: &TextureInfo) -> u64 {
+    let texture = container.document.textures.get(info.index);
+    let image = texture.and_then(|texture| texture.source);
+    image.and_then(|image| with_bytes(container, image, Image::need).ok()).unwrap_or(0)
+}
+
+/// Calls `read` with the bytes of an image.
+fn with_bytes<T>(
+    container: &mut Container,
+    index: usize,
+    read: impl FnOnce(&[u8]) -> Result<T>,
+) -> Result<T> {
     let images = &container.document.images;
     let found = images.get(index).ok_or_else(|| missing("image", index, images.len()))?;
     match (found.uri.clone(), found.buffer_view) {
         (Some(uri), _) => {
             let bytes = container.image_uri(&uri, index)?;
-            let image = Image::decode(&bytes, container.budget.left());
+            let found = read(&bytes);
             container.release(bytes);
-            image
+            found
         }
-        (None, Some(view)) => {
-            let left = container.budget.left();
-            Image::decode(container.view(view)?.0, left)
-        }
+        (None, Some(view)) => read(container.view(view)?.0),
         (None, None) => Err(Error::invalid(format!("image {index} has no data"))),
     }
 }

@@ -105,7 +105,6 @@ impl Sorted {
         options: &ImportOptions,
         report: &mut ImportReport,
     ) -> Result<()> {
-        report.source.vertices = self.parts.vertices.len();
         let radius = self.radius(options.meters_per_unit)?;
         if self.parts.carried.radius && !self.parts.traits.radii {
             radius::warn(radius, report);

@@ -1,6 +1,5 @@
 //! The elements of a mesh on disk, as they were read, and the faces among them that can be used.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec3, Vec3};

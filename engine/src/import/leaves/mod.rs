@@ -45,19 +45,19 @@ impl<'a> Leaves<'a> {
     }
 
     /// The faces of `mesh`, by a texture whose alpha is read as `alpha` and multiplied by `factor`. `corner` gives the
-    /// texture coordinates and the alpha of each of its corners.
+    /// texture coordinates and the alpha of each of its corners. Parts are at most so many texels long, and as dicing asks.
     pub fn new(
         mesh: &'a Mesh,
         (texture, alpha, factor): (&'a Texture, AlphaMode, f32),
         corner: &'a dyn Fn(usize) -> (Vec2, f32),
-        options: &'a ImportOptions,
+        (texels, rate): (Option<f64>, Option<&'a Rate>),
     ) -> Self {
         Self {
             mesh,
             corner,
             averager: Averager::new(texture, alpha, factor, mesh.faces.len()),
-            texels: options.texels.unwrap_or(TEXELS) as f32,
-            rate: options.dice.as_ref(),
+            texels: texels.unwrap_or(TEXELS) as f32,
+            rate,
             patterns: Patterns::default(),
         }
     }

@@ -32,8 +32,8 @@ fn cut(alpha: AlphaMode, texels: f64) -> (Collect, ImportReport) {
     // The card's edges lie a hair inside of the image, which repeats
     let uvs = [[0.0, 0.0], [0.9999, 0.0], [0.9999, 0.9999], [0.0, 0.9999]].map(Vec2::from_array);
     let corner = |corner: usize| (uvs[card.corners[corner] as usize], 1.0);
-    let options = ImportOptions { texels: Some(texels), ..ImportOptions::default() };
-    let mut leaves = Leaves::new(&card, (&texture, alpha, 1.0), &corner, &options);
+    let options = ImportOptions::default();
+    let mut leaves = Leaves::new(&card, (&texture, alpha, 1.0), &corner, (Some(texels), None));
     let count = leaves.count(&Placement::HERE).unwrap();
     let mut sink = Collect::default();
     let carried = Carried { normal: true, albedo: true, opacity: true, ..Carried::default() };

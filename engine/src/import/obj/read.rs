@@ -8,7 +8,7 @@ use glam::{DVec3, Vec3};
 use super::mtl::{self, Material, rest_of};
 use crate::import::large::Elements;
 use crate::import::lines::{self, LineReader};
-use crate::import::mesh::{Face, Mesh, NO_NORMAL};
+use crate::import::mesh::{Face, NO_NORMAL};
 use crate::import::{ImportOptions, ImportReport, confine};
 use crate::{Error, ErrorKind, Result};
 

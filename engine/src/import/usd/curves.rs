@@ -1,11 +1,12 @@
 //! BasisCurves prims: curves of all bases become lines of varying radius.
 
+use std::ops::Range;
+
 use glam::DVec3;
 
 use super::basis::{Basis, Weight, Wrap};
 use super::dress::{Elements, dress};
 use super::points::widths;
-use super::polygons::need_memory;
 use super::primvar::{Interpolation, Values};
 use super::read::{Geometry, Stage};
 use super::value;
@@ -29,8 +30,11 @@ struct Sample {
     varying: (u32, u32, f32),
 }
 
-/// Reads curves.
-pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
+/// Points of the curves that are read at once, about: some 300 MB with all that is made of them.
+pub(super) const PART_POINTS: usize = if cfg!(test) { 1 << 12 } else { 1 << 19 };
+
+/// Reads the curves of one of the prim's parts: those whose first point is one of its [`PART_POINTS`].
+pub(super) fn read(stage: &Stage, prim: &Prim, part: usize, attributes: &[Attribute]) -> Result<Geometry> {
     let path = prim.path.as_str();
     let mut geometry = Geometry::default();
     let points = stage.value(path, "points").and_then(|value| value::vectors(&value)).unwrap_or_default();
@@ -40,7 +44,6 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         let found = points.len();
         return Err(stage.broken(path, format!("{found} points, `curveVertexCounts` has {total}")));
     }
-    geometry.report.source.vertices = points.len() as u64;
     let text = |name| stage.text(path, name);
     let basis = match (text("type").as_deref(), text("basis").as_deref()) {
         (Some("linear"), _) => Basis::Linear,
@@ -53,12 +56,13 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         Some("pinned") => Wrap::Pinned,
         _ => Wrap::Open,
     };
-    let mut sampler = Sampler { basis, wrap, points: &points, widths: None, samples: Vec::new(), ends: 0 };
     let sizes = Sizes::of(basis, wrap, &counts);
-    sampler.widths = widths(stage, prim).filter(|widths| widths.len() >= sizes.count(widths.interpolation));
-    need_memory(stage, path, sampler.estimate(&counts), 2 * points.len(), points.len(), attributes)?;
-    sampler.run(&counts, &mut geometry)?;
-    let Geometry { mesh, report } = &mut geometry;
+    let widths = widths(stage, prim).filter(|widths| widths.len() >= sizes.count(widths.interpolation));
+    let all = widths.iter().flat_map(|widths| &widths.values);
+    let width_max = f64::from(all.copied().fold(0.0, f32::max));
+    let mut sampler = Sampler { basis, wrap, points: &points, width_max, samples: Vec::new(), ends: 0 };
+    sampler.run(&counts, part * PART_POINTS..(part + 1) * PART_POINTS, &mut geometry)?;
+    let Geometry { mesh, report, .. } = &mut geometry;
 
     // Everything a prim has for its curves and points is summed for the samples
     let samples = &sampler.samples;
@@ -67,7 +71,7 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
     };
     mesh.positions = samples.iter().map(|sample| sum(&points, &sample.vertex)).collect();
     mesh.point_numbers = samples.iter().map(point_number).collect();
-    if let Some(widths) = &sampler.widths {
+    if let Some(widths) = &widths {
         mesh.radii = at_samples(widths, samples).values.iter().map(|width| 0.5 * width).collect();
     }
     let elements = Elements { faces: 1, points: samples.len(), corners: samples.len(), corner_sources: &[] };
@@ -145,30 +149,39 @@ struct Sampler<'a> {
     basis: Basis,
     wrap: Wrap,
     points: &'a [DVec3],
-    widths: Option<Values>,
+    /// The largest width; zero where there are none.
+    width_max: f64,
     samples: Vec<Sample>,
     /// Values per end of a span that the curves so far have.
     ends: u32,
 }
 
 impl Sampler<'_> {
-    /// About how many samples there will be at most, for a first look at the memory.
-    fn estimate(&self, counts: &[i64]) -> usize {
-        let per_point = if self.basis == Basis::Linear { 1 } else { 4 };
-        counts.len() + self.points.len() * per_point
-    }
-
-    fn run(&mut self, counts: &[i64], geometry: &mut Geometry) -> Result<()> {
+    /// Adds the curves whose first point is in `wanted`.
+    fn run(&mut self, counts: &[i64], wanted: Range<usize>, geometry: &mut Geometry) -> Result<()> {
         let mut first = 0;
         for (curve, &count) in counts.iter().enumerate() {
             let count = count as usize;
-            match self.basis.spans(self.wrap, count) {
-                Some(spans) => self.curve(curve as u32, first, count, spans, geometry)?,
-                None => geometry.report.skip("curves of a number of points that their basis cannot have", 1),
+            let spans = self.basis.spans(self.wrap, count);
+            let is_wanted = wanted.contains(&first);
+            geometry.report.source.vertices += if is_wanted { count as u64 } else { 0 };
+            match spans {
+                Some(spans) if is_wanted => self.curve(curve as u32, first, count, spans, geometry)?,
+                // Values of the curves before are passed over
+                Some(spans) => self.ends += self.ends_of(spans),
+                None => {
+                    let reason = "curves of a number of points that their basis cannot have";
+                    geometry.report.skip(reason, u64::from(is_wanted));
+                }
             }
             first += count;
         }
         Ok(())
+    }
+
+    /// Ends of spans that a curve has.
+    fn ends_of(&self, spans: usize) -> u32 {
+        if self.wrap == Wrap::Periodic { spans as u32 } else { spans as u32 + 1 }
     }
 
     /// Adds the samples and lines of a curve, whose points begin at `first`.
@@ -182,7 +195,7 @@ impl Sampler<'_> {
     ) -> Result<()> {
         let start = self.samples.len() as u32;
         let is_periodic = self.wrap == Wrap::Periodic;
-        let ends = if is_periodic { spans } else { spans + 1 } as u32;
+        let ends = self.ends_of(spans);
         for span in 0..spans {
             let control = self.basis.control(self.wrap, count, span);
             let lines = self.lines(&control, first);
@@ -232,9 +245,7 @@ impl Sampler<'_> {
         };
         let points: [DVec3; 4] = std::array::from_fn(|i| place(&control[i]));
         let chord = points[3].distance(points[0]);
-        let width =
-            self.widths.as_ref().map_or(0.0, |widths| widths.values.iter().copied().fold(0.0, f32::max));
-        let tolerance = if width > 0.0 { 0.125 * f64::from(width) } else { 0.01 * chord };
+        let tolerance = if self.width_max > 0.0 { 0.125 * self.width_max } else { 0.01 * chord };
         let lines = (self.basis.bend(&points) / (8.0 * tolerance)).sqrt().ceil();
         // What is not a number becomes one line
         lines.clamp(1.0, LINES_MAX).max(1.0) as u32

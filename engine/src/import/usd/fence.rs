@@ -26,12 +26,15 @@ pub(super) type Stop = Arc<AtomicBool>;
 
 /// The library's side of the fence, seen from outside.
 pub(super) struct Reader {
-    requests: SyncSender<usize>,
+    requests: SyncSender<Request>,
     answers: Receiver<Answer>,
     stop: Stop,
     path: PathBuf,
     patience: Duration,
 }
+
+/// A prim by its number in the catalogue, and one of its parts.
+type Request = (usize, usize);
 
 enum Answer {
     Catalogue(Result<Box<Catalogue>>),
@@ -60,9 +63,9 @@ impl Reader {
         }
     }
 
-    /// Reads the prim of this number in the catalogue.
-    pub fn geometry(&self, number: usize) -> Result<Geometry> {
-        self.requests.send(number).map_err(|_| self.gone())?;
+    /// Reads a part of the prim of this number in the catalogue.
+    pub fn geometry(&self, number: usize, part: usize) -> Result<Geometry> {
+        self.requests.send((number, part)).map_err(|_| self.gone())?;
         match self.answer()? {
             Answer::Geometry(geometry) => geometry.map(|geometry| *geometry),
             Answer::Catalogue(_) => Err(self.gone()),
@@ -97,7 +100,7 @@ fn serve(
     path: &Path,
     options: &ImportOptions,
     stop: Stop,
-    wanted: &Receiver<usize>,
+    wanted: &Receiver<Request>,
     answers: &SyncSender<Answer>,
 ) {
     let opened = fenced(path, || {
@@ -117,9 +120,9 @@ fn serve(
     if answers.send(Answer::Catalogue(Ok(catalogue))).is_err() {
         return;
     }
-    while let Ok(number) = wanted.recv() {
+    while let Ok((number, part)) = wanted.recv() {
         let geometry = match prims.get(number) {
-            Some(prim) => fenced(path, || stage.geometry(prim, &attributes).map(Box::new)),
+            Some(prim) => fenced(path, || stage.geometry(prim, part, &attributes).map(Box::new)),
             None => Err(Error::invalid("a prim that is not in the catalogue")),
         };
         if answers.send(Answer::Geometry(geometry)).is_err() {

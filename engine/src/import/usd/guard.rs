@@ -4,6 +4,7 @@ use std::cell::Cell;
 use std::io::{self, Cursor, Read, Seek};
 use std::panic::resume_unwind;
 use std::path::PathBuf;
+use std::rc::Rc;
 use std::sync::atomic::Ordering;
 
 use openusd::ar::{Asset, DefaultResolver, ResolvedPath, Resolver};
@@ -24,7 +25,7 @@ const NESTING_MAX: u32 = 1024;
 pub(super) struct Guard {
     inner: DefaultResolver,
     path: PathBuf,
-    bytes_left: Cell<u64>,
+    bytes_left: Rc<Cell<u64>>,
     files: Cell<u32>,
     lookups: Cell<u64>,
     stop: Stop,
@@ -37,11 +38,16 @@ impl Guard {
         Self {
             inner,
             path,
-            bytes_left: Cell::new(bytes_max),
+            bytes_left: Rc::new(Cell::new(bytes_max)),
             files: Cell::new(0),
             lookups: Cell::new(0),
             stop,
         }
+    }
+
+    /// The bytes of layers that may still be read, at any time.
+    pub fn bytes_left(&self) -> Rc<Cell<u64>> {
+        self.bytes_left.clone()
     }
 
     fn count_lookup(&self) {

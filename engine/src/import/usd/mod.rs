@@ -5,11 +5,13 @@
 //! copies.
 
 mod basis;
+mod cover;
 mod curves;
 mod dress;
 mod fence;
 mod guard;
 mod instancer;
+mod material;
 mod points;
 mod polygons;
 mod primvar;
@@ -23,13 +25,17 @@ mod xform;
 use std::path::Path;
 use std::sync::Arc;
 
+use self::cover::Leaf;
 use self::fence::Reader;
+use self::read::Geometry;
 use self::walk::{Catalogue, Kind, Prim};
 use super::assembly::Assembly;
 use super::emit::{Carried, Emitter, Placement};
+use super::leaves::{self, Leaves};
 use super::mesh::Mesh;
-use super::{Copies, GridSink, ImportOptions, ImportReport, SourceCounts, cut, diced, radius};
+use super::{Copies, Expected, GridSink, ImportOptions, ImportReport, SourceCounts, cut, diced, radius};
 use crate::dice::Rate;
+use crate::stream::Attribute;
 use crate::stream::adapt::MatrixSource;
 use crate::stream::schema::UpAxis;
 use crate::{Error, ErrorKind, Result};
@@ -52,13 +58,13 @@ const PRIMS_BYTES_MAX: usize = 960 << 10;
 /// Imports a USD file.
 pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {
     let (reader, catalogue) = Reader::open(path, options)?;
-    let Catalogue { prims, assembly, attributes, space, mut report } = catalogue;
+    let Catalogue { prims, assembly, attributes, space, memory_bytes, mut report } = catalogue;
     let carried = Carried {
         normal: prims.iter().any(|prim| prim.kind == Kind::Mesh || prim.has_normals),
         albedo: has(&prims, "displayColor"),
-        opacity: has(&prims, "displayOpacity"),
+        opacity: has(&prims, "displayOpacity") || prims.iter().any(|prim| !prim.materials.is_empty()),
         radius: prims.iter().any(|prim| prim.kind != Kind::Mesh),
-        extras: attributes,
+        extras: attributes.clone(),
         point: true,
     };
     let assembly = Arc::new(assembly);
@@ -68,13 +74,16 @@ pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSi
     let mut import = Import {
         reader,
         options,
+        attributes,
         listed: assembly.counts(|inner| inner.listed),
         counts: assembly.counts(|inner| inner.placed),
         assembly,
-        emitter: Emitter::with_metadata(sink, carried, options, &metadata)?,
         report,
     };
-    import.run(&prims)?;
+    let leaves = import.count_leaves(&prims)?;
+    sink.expect(&Expected { memory_bytes, leaves })?;
+    let mut emitter = Emitter::with_metadata(sink, carried, options, &metadata)?;
+    import.run(&prims, &mut emitter)?;
     Ok(import.report)
 }
 
@@ -107,38 +116,119 @@ struct Import<'a> {
     counts: Vec<u64>,
     /// Per scope how often the file's own count of its prims has it.
     listed: Vec<u64>,
-    emitter: Emitter<'a>,
+    /// What primvars become.
+    attributes: Vec<Attribute>,
     report: ImportReport,
 }
 
+/// A prim that is ready to be written.
+struct Prepared {
+    /// What is written as it is; not finished if it is a surface to be diced.
+    mesh: Mesh,
+    clusters: cut::Clusters,
+    radius: f32,
+    leaves: Vec<Leaf>,
+    /// The centre of all of it, in its scope.
+    center: glam::DVec3,
+}
+
 impl Import<'_> {
-    /// Writes what stands once, then each prototype.
-    fn run(&mut self, prims: &[Prim]) -> Result<()> {
-        let mut prototypes: Vec<u32> =
-            prims.iter().map(|prim| prim.scope).filter(|&scope| self.counts[scope as usize] > 1).collect();
+    /// The scopes that are written once for all their copies, in ascending order.
+    fn prototypes(&self, prims: &[Prim]) -> Vec<u32> {
+        let scopes = prims.iter().map(|prim| prim.scope);
+        let mut prototypes: Vec<u32> = scopes.filter(|&scope| self.counts[scope as usize] > 1).collect();
         prototypes.sort_unstable();
         prototypes.dedup();
         prototypes.truncate(PROTOTYPES_MAX);
+        prototypes
+    }
+
+    fn copies(&self, scope: u32) -> Copies {
+        Copies::new(self.assembly.clone(), scope, self.counts[scope as usize])
+    }
+
+    /// Writes what stands once, then each prototype.
+    fn run(&mut self, prims: &[Prim], emitter: &mut Emitter<'_>) -> Result<()> {
+        let prototypes = self.prototypes(prims);
         for (number, prim) in prims.iter().enumerate() {
             if prototypes.binary_search(&prim.scope).is_err() {
-                let copies = Copies::new(self.assembly.clone(), prim.scope, self.counts[prim.scope as usize]);
-                self.prim(number, prim, copies, false)?;
+                (0..prim.parts).try_for_each(|part| self.prim((number, part), prim, false, emitter))?;
             }
         }
         for scope in prototypes {
-            let copies = Copies::new(self.assembly.clone(), scope, self.counts[scope as usize]);
-            self.emitter.copies(&copies)?;
+            emitter.copies(&self.copies(scope))?;
             for (number, prim) in prims.iter().enumerate().filter(|(_, prim)| prim.scope == scope) {
-                self.prim(number, prim, copies.clone(), true)?;
+                (0..prim.parts).try_for_each(|part| self.prim((number, part), prim, true, emitter))?;
             }
         }
         Ok(())
     }
 
-    /// Reads a prim and writes it: once for each of `copies`, or once as a part of their prototype.
-    fn prim(&mut self, number: usize, prim: &Prim, mut copies: Copies, is_prototype: bool) -> Result<()> {
-        let read = match self.reader.geometry(number) {
-            Ok(read) => read,
+    /// How many micropolygons leaves will become; refuses more than allowed.
+    fn count_leaves(&mut self, prims: &[Prim]) -> Result<u64> {
+        let prototypes = self.prototypes(prims);
+        let mut count = 0_u64;
+        for (number, prim) in prims.iter().enumerate() {
+            if !Leaves::are_wanted(self.options) || prim.materials.is_empty() {
+                continue;
+            }
+            // What is found on the way is reported when it is read to be written
+            let Ok(prepared) = self.prepare((number, 0), prim, &mut ImportReport::default()) else {
+                continue;
+            };
+            let is_prototype = prototypes.binary_search(&prim.scope).is_ok();
+            self.each_place(prim, &prepared, is_prototype, |placement, rate| {
+                for leaf in &prepared.leaves {
+                    let corner = |corner| leaf.corner(corner);
+                    count = count.saturating_add(self.leaves(leaf, &corner, rate).count(placement)?);
+                }
+                Ok(())
+            })?;
+        }
+        leaves::check_count(count, self.options)?;
+        Ok(count)
+    }
+
+    /// A leaf, cut as options ask at a rate.
+    fn leaves<'b>(
+        &self,
+        leaf: &'b Leaf,
+        corner: &'b dyn Fn(usize) -> (glam::Vec2, f32),
+        rate: Option<&'b Rate>,
+    ) -> Leaves<'b> {
+        let look = (&leaf.texture, leaf.alpha, leaf.opacity);
+        Leaves::new(&leaf.mesh, look, corner, (self.options.texels, rate))
+    }
+
+    /// Reads a part of a prim and makes it ready.
+    fn prepare(&self, which: (usize, usize), prim: &Prim, report: &mut ImportReport) -> Result<Prepared> {
+        let Geometry { mut mesh, report: own, covers } = self.reader.geometry(which.0, which.1)?;
+        *report = own;
+        let is_surface = self.options.dice.is_some() && mesh.subdivision.is_some();
+        let cut = Leaves::are_wanted(self.options) && !is_surface;
+        let leaves = cover::apply(&mut mesh, covers, &self.attributes, cut, report)?;
+        // Dicing finishes what it makes, and needs the polygons of a surface as they are
+        let raw = is_surface.then(|| mesh.clone());
+        mesh.finish(report)?;
+        let clusters = cut::cut(&mesh);
+        let radius = radius::default_radius(&mesh, &clusters, self.options.meters_per_unit);
+        radius::warn_radius(&mesh, radius, report);
+        let center = prim.scope_from_prim.transform_point3(cover::center(&mesh, &leaves));
+        Ok(Prepared { mesh: raw.unwrap_or(mesh), clusters, radius, leaves, center })
+    }
+
+    /// Reads a part of a prim and writes it: once for each copy, or once as a part of their prototype.
+    fn prim(
+        &mut self,
+        (number, part): (usize, usize),
+        prim: &Prim,
+        is_prototype: bool,
+        emitter: &mut Emitter<'_>,
+    ) -> Result<()> {
+        let id = u32::try_from(number).map_err(|_| Error::new(ErrorKind::Limit, "more than 2^32 prims"))?;
+        let mut own = ImportReport::default();
+        let prepared = match self.prepare((number, part), prim, &mut own) {
+            Ok(prepared) => prepared,
             // A broken layer ends its geometry; a limit, or a reader that is gone, ends the import
             Err(error) if error.kind() == ErrorKind::Invalid => {
                 self.report.skip("prims that cannot be read", 1);
@@ -147,44 +237,49 @@ impl Import<'_> {
             }
             Err(error) => return Err(error),
         };
-        let (mut mesh, mut own) = (read.mesh, read.report);
-        // Dicing finishes what it makes, and needs the polygons of a surface as they are
-        let raw = (self.options.dice.is_some() && mesh.subdivision.is_some()).then(|| mesh.clone());
-        mesh.finish(&mut own)?;
         self.count(&own, self.listed[prim.scope as usize]);
-        let clusters = cut::cut(&mesh);
-        let radius = radius::default_radius(&mesh, &clusters, self.options.meters_per_unit);
-        radius::warn_radius(&mesh, radius, &mut self.report);
-        let center = prim.scope_from_prim.transform_point3(mesh.bounds().center());
-        let mesh = raw.unwrap_or(mesh);
-        let rate = self.options.dice.as_ref();
-        let mut emit = |matrix: glam::DMat4, rate: Option<&Rate>| {
-            self.emit(&mesh, &clusters, matrix * prim.scope_from_prim, rate, (number, radius))
-        };
-        if is_prototype {
-            let rate = rate.map(|rate| diced::prototype_rate(rate, &mut copies, center)).transpose()?;
-            return emit(glam::DMat4::IDENTITY, rate.as_ref());
-        }
-        while let Some(world_from_scope) = copies.next()? {
-            emit(world_from_scope, rate)?;
-        }
+        let mut report = std::mem::take(&mut self.report);
+        let Prepared { mesh, clusters, radius, leaves, .. } = &prepared;
+        let flat = self.each_place(prim, &prepared, is_prototype, |placement, rate| {
+            emitter.emit_diced(mesh, clusters, placement, rate, (id, *radius), &mut report)?;
+            for leaf in leaves {
+                let corner = |corner| leaf.corner(corner);
+                self.leaves(leaf, &corner, rate).emit(emitter, placement, id, &mut report)?;
+            }
+            Ok(())
+        });
+        self.report = report;
+        self.report.skip("prims whose transform is flat or not finite", flat?);
         Ok(())
     }
 
-    fn emit(
-        &mut self,
-        mesh: &Mesh,
-        clusters: &cut::Clusters,
-        matrix: glam::DMat4,
-        rate: Option<&Rate>,
-        (number, radius): (usize, f32),
-    ) -> Result<()> {
-        let id = u32::try_from(number).map_err(|_| Error::new(ErrorKind::Limit, "more than 2^32 prims"))?;
-        let Some(placement) = Placement::new(matrix) else {
-            self.report.skip("prims whose transform is flat or not finite", 1);
-            return Ok(());
+    /// Calls `take` for each place where a prim is written, and with the rate there. Returns how many are flat.
+    fn each_place(
+        &self,
+        prim: &Prim,
+        prepared: &Prepared,
+        is_prototype: bool,
+        mut take: impl FnMut(&Placement, Option<&Rate>) -> Result<()>,
+    ) -> Result<u64> {
+        let (mut copies, rate) = (self.copies(prim.scope), self.options.dice.as_ref());
+        let mut flat = 0;
+        let mut place = |matrix: glam::DMat4, rate: Option<&Rate>| -> Result<()> {
+            match Placement::new(matrix * prim.scope_from_prim) {
+                Some(placement) => take(&placement, rate)?,
+                None => flat += 1,
+            }
+            Ok(())
         };
-        self.emitter.emit_diced(mesh, clusters, &placement, rate, (id, radius), &mut self.report)
+        if is_prototype {
+            let rate =
+                rate.map(|rate| diced::prototype_rate(rate, &mut copies, prepared.center)).transpose()?;
+            place(glam::DMat4::IDENTITY, rate.as_ref())?;
+            return Ok(flat);
+        }
+        while let Some(world_from_scope) = copies.next()? {
+            place(world_from_scope, rate)?;
+        }
+        Ok(flat)
     }
 
     /// Adds what was found in a prim, as often as the file lists it.

@@ -16,7 +16,7 @@ const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 2
 pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
     let path = prim.path.as_str();
     let mut geometry = Geometry::default();
-    let Geometry { mesh, report } = &mut geometry;
+    let Geometry { mesh, report, .. } = &mut geometry;
     let points = stage.value(path, "points");
     mesh.single_precision = matches!(points, Some(openusd::sdf::Value::Vec3fVec(_)));
     if let Some(points) = points {

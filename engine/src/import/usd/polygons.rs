@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use glam::Vec3;
 
 use super::dress::{Elements, dress};
+use super::material::{self, Cover};
 use super::primvar::{self, Interpolation, Primvar, Values};
 use super::read::{Geometry, Stage};
 use super::value;
@@ -20,10 +21,12 @@ const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 2
 pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
     let path = prim.path.as_str();
     let mut geometry = Geometry::default();
-    let Geometry { mesh, report } = &mut geometry;
+    let Geometry { mesh, report, covers } = &mut geometry;
     let points = stage.value(path, "points");
     let counts = stage.integers(path, "faceVertexCounts").unwrap_or_default();
     let indices = stage.integers(path, "faceVertexIndices").unwrap_or_default();
+    *covers = material::covers(stage, &prim.materials, report);
+    let materials = materials(covers, counts.len());
     mesh.single_precision = matches!(points, Some(openusd::sdf::Value::Vec3fVec(_)));
     if let Some(points) = points {
         mesh.positions =
@@ -57,7 +60,8 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         }
         corner_sources.extend(corners.iter().map(|&corner| (number as u32, corner)));
         corners.iter_mut().for_each(|corner| *corner = indices[*corner as usize] as u32);
-        mesh.push_face(FACE, &corners, report)?;
+        let material = materials.get(number).copied().unwrap_or(0);
+        mesh.push_face(Face { material, ..FACE }, &corners, report)?;
     }
     let scheme = stage.text(path, "subdivisionScheme").unwrap_or_else(|| "catmullClark".into());
     if scheme == "loop" {
@@ -77,7 +81,29 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         push_normals(stage, prim, &elements, mesh);
     }
     dress(stage, prim, attributes, &elements, &Some, mesh, report);
+    if let Some(&color) = mesh.palette.first() {
+        mesh.palette.resize(covers.len() + 1, color);
+    }
     Ok(geometry)
+}
+
+/// The cover of each of `faces` faces, from 1; empty where there is none.
+fn materials(covers: &[Cover], faces: usize) -> Vec<u32> {
+    let mut materials = vec![0; if covers.is_empty() { 0 } else { faces }];
+    for (cover, number) in covers.iter().zip(1..) {
+        match &cover.faces {
+            None => materials.fill(number),
+            Some(faces) => {
+                let faces = faces.iter().filter_map(|&face| usize::try_from(face).ok());
+                for face in faces {
+                    if let Some(material) = materials.get_mut(face) {
+                        *material = number;
+                    }
+                }
+            }
+        }
+    }
+    materials
 }
 
 /// The creases and corners of a subdivision surface. Lists that do not fit together end where they no longer do.
@@ -143,10 +169,11 @@ fn check(
         let index = indices[corner];
         return Err(stage.broken(path, format!("corner {corner} is point {index} of {points} points")));
     }
-    need_memory(stage, path, points, indices.len(), counts.len(), attributes)
+    need_memory(stage, path, points, indices.len(), counts.len(), attributes)?;
+    Ok(())
 }
 
-/// Refuses what would not fit.
+/// The bytes that a prim takes; refuses what would not fit.
 pub(super) fn need_memory(
     stage: &Stage,
     path: &str,
@@ -154,7 +181,7 @@ pub(super) fn need_memory(
     corners: usize,
     faces: usize,
     attributes: &[Attribute],
-) -> Result<()> {
+) -> Result<u64> {
     let values: u64 = attributes.iter().map(|attribute| attribute.value_bytes() as u64).sum();
     let bytes =
         Mesh::bytes(points as u64, corners as u64, faces as u64) + (corners.max(points) as u64) * values;
@@ -165,7 +192,7 @@ pub(super) fn need_memory(
             .at(&stage.path)
             .hint("allow more memory (`--memory`), or cut the prim into parts"));
     }
-    Ok(())
+    Ok(bytes)
 }
 
 /// Gives a mesh the normals that are written, where there is one for each element.

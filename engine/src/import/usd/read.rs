@@ -1,12 +1,15 @@
 //! The composed stage: values at the frame that is imported, and prims as meshes.
 
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 use openusd::sdf::Value;
 use openusd::usd::{self, TimeCode};
 
 use super::fence::Stop;
 use super::guard::Guard;
+use super::material::{Cover, Images};
 use super::walk::{Kind, Prim};
 use super::{curves, points, polygons};
 use crate::import::ImportOptions;
@@ -22,6 +25,8 @@ pub(super) struct Geometry {
     pub mesh: Mesh,
     /// What was counted and left out.
     pub report: ImportReport,
+    /// What lets light through. Faces name it by their material, from 1.
+    pub covers: Vec<Cover>,
 }
 
 /// An open file.
@@ -34,6 +39,9 @@ pub(super) struct Stage {
     pub memory_bytes: u64,
     /// Metres per unit of the scene, and its up axis.
     pub options: ImportOptions,
+    /// Textures read so far.
+    pub images: Images,
+    layer_bytes_left: Rc<Cell<u64>>,
     frame: Option<f64>,
 }
 
@@ -45,6 +53,7 @@ impl Stage {
         let name = path.to_str().ok_or_else(|| Error::invalid("a path that is not UTF-8").at(path))?;
         // What layers hold is decoded as they are opened: about twice their size on disk and more
         let guard = Guard::new(path.to_path_buf(), options.memory_bytes / 2, stop);
+        let layer_bytes_left = guard.bytes_left();
         let stage = usd::Stage::builder().resolver(guard).open(name).map_err(|error| {
             Error::new(ErrorKind::Corrupt, format!("not a USD file that can be read: {error:#}")).at(path)
         })?;
@@ -53,8 +62,16 @@ impl Stage {
             path: path.to_path_buf(),
             memory_bytes: options.memory_bytes,
             options: options.clone(),
+            images: Images::default(),
+            layer_bytes_left,
             frame: options.frame,
         })
+    }
+
+    /// What the layers read so far take once they are decoded.
+    pub fn layer_bytes(&self) -> u64 {
+        let limit = self.memory_bytes / 2;
+        2 * (limit - self.layer_bytes_left.get().min(limit))
     }
 
     /// The value of an attribute at the frame; without one its default, or else its first sample.
@@ -90,14 +107,13 @@ impl Stage {
         self.stage.attribute(format!("{prim}.{attribute}")).get_metadata::<Value>(field).ok().flatten()
     }
 
-    /// Reads a prim; `attributes` are those that primvars become.
-    pub fn geometry(&self, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
-        let read = match prim.kind {
-            Kind::Mesh => polygons::read,
-            Kind::Points => points::read,
-            Kind::Curves => curves::read,
-        };
-        read(self, prim, attributes)
+    /// Reads a part of a prim; `attributes` are those that primvars become.
+    pub fn geometry(&self, prim: &Prim, part: usize, attributes: &[Attribute]) -> Result<Geometry> {
+        match prim.kind {
+            Kind::Mesh => polygons::read(self, prim, attributes),
+            Kind::Points => points::read(self, prim, attributes),
+            Kind::Curves => curves::read(self, prim, part, attributes),
+        }
     }
 
     /// An error about a prim.

@@ -10,15 +10,15 @@ use crate::stream::schema::{UpAxis, names};
 use crate::stream::{Microgrid, MicrogridStream, Schema};
 use crate::{ErrorKind, Result};
 
-struct Desk(tempfile::TempDir);
+pub(super) struct Desk(pub tempfile::TempDir);
 
 impl Desk {
-    fn new() -> Self {
+    pub fn new() -> Self {
         Self(tempfile::tempdir().unwrap())
     }
 
     /// Writes a text layer.
-    fn layer(&self, name: &str, text: &str) -> PathBuf {
+    pub fn layer(&self, name: &str, text: &str) -> PathBuf {
         let path = self.0.path().join(name);
         std::fs::write(&path, format!("#usda 1.0\n{text}")).unwrap();
         path
@@ -26,9 +26,9 @@ impl Desk {
 }
 
 /// In metres, which the layers here are in as well.
-const HEAD: &str = "(\n    metersPerUnit = 1\n)\n";
+pub(super) const HEAD: &str = "(\n    metersPerUnit = 1\n)\n";
 
-fn read(path: &Path, options: &ImportOptions) -> Result<(Collect, ImportReport)> {
+pub(super) fn read(path: &Path, options: &ImportOptions) -> Result<(Collect, ImportReport)> {
     let mut sink = Collect::default();
     let report = import(path, options, &mut sink)?;
     Ok((sink, report))
@@ -434,4 +434,51 @@ def Mesh "ball" {
     }
     assert!(edges.values().all(|&balance| balance == 0));
     assert_eq!(points.into_iter().collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5, 6, 7, u32::MAX]);
+}
+
+/// Catches curves that are lost, doubled or misplaced where a prim is read in parts, far from the origin too.
+#[test]
+fn many_curves_are_read_in_parts() {
+    let count = super::curves::PART_POINTS / 2 + 1000;
+    let place = |i: usize| (i % 600, i / 600);
+    let points = (0..count).map(|i| {
+        let (x, y) = place(i);
+        format!("({x},{y},0),({x},{y},1)")
+    });
+    let points = points.collect::<Vec<_>>().join(",");
+    let widths = (0..count).map(|i| if i % 2 == 0 { "0.5,0.125" } else { "0.25,0.0625" });
+    let widths = widths.collect::<Vec<_>>().join(",");
+    let counts = vec!["2"; count].join(",");
+    let text = format!(
+        r#"{HEAD}def Xform "far" {{
+    double3 xformOp:translate = (4194304, 0, -1048576)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    def BasisCurves "hair" {{
+        uniform token type = "linear"
+        int[] curveVertexCounts = [{counts}]
+        point3f[] points = [{points}]
+        float[] widths = [{widths}] ( interpolation = "vertex" )
+    }}
+}}
+"#
+    );
+    let desk = Desk::new();
+    let (sink, report) = read(&desk.layer("a.usda", &text), &ImportOptions::default()).unwrap();
+    assert_eq!((report.source.vertices, report.source.lines), (2 * count as u64, count as u64));
+    assert_eq!(report.micropolygons, count as u64);
+    let radius = sink.schema.find(names::RADIUS).unwrap();
+    let mut seen = vec![false; count];
+    for grid in &sink.grids {
+        for face in grid.faces() {
+            let [root, tip] = [face[0], face[1]].map(usize::from);
+            let p = grid.position(root) - DVec3::new(4_194_304.0, 0.0, -1_048_576.0);
+            assert_eq!(p, p.round());
+            let i = p.y as usize * 600 + p.x as usize;
+            assert!(!std::mem::replace(&mut seen[i], true));
+            let wide = if i % 2 == 0 { 0.25 } else { 0.125 };
+            let radii = [root, tip].map(|v| grid.value(&sink.schema, radius, v, 0));
+            assert_eq!(radii, [wide, wide / 4.0]);
+        }
+    }
+    assert!(seen.into_iter().all(|seen| seen));
 }

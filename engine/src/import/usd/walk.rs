@@ -6,9 +6,10 @@ use std::rc::Rc;
 use glam::{DMat4, DVec3, DVec4};
 use openusd::sdf::Specifier;
 
+use super::curves::PART_POINTS;
 use super::primvar::{self, Primvar};
 use super::read::Stage;
-use super::{dress, instancer, xform};
+use super::{dress, instancer, material, polygons, xform};
 use crate::import::ImportReport;
 use crate::import::assembly::{Assembly, Use};
 use crate::import::emit::Placement;
@@ -51,8 +52,12 @@ pub(super) struct Prim {
     pub primvars: Vec<Primvar>,
     /// How many points it has.
     pub points: usize,
+    /// Parts that it is read in.
+    pub parts: usize,
     /// Whether it writes normals of its own.
     pub has_normals: bool,
+    /// The surface shaders of its materials, and the subsets of faces that have them, if any lets light through.
+    pub materials: Vec<(String, Option<String>)>,
     /// Whether it stands in a prototype, where an over would reach all copies or none.
     pub is_shared: bool,
 }
@@ -68,6 +73,8 @@ pub(super) struct Catalogue {
     pub attributes: Vec<Attribute>,
     /// Metres per unit, and the up axis, of the stage.
     pub space: (f64, UpAxis),
+    /// Bytes that reading takes at most: the layers, and the largest prim.
+    pub memory_bytes: u64,
     /// What was left out.
     pub report: ImportReport,
 }
@@ -80,6 +87,7 @@ pub(super) fn catalogue(stage: &Stage) -> Result<Catalogue> {
         assembly: Assembly::default(),
         attributes: Vec::new(),
         space,
+        memory_bytes: 0,
         report: ImportReport::default(),
     };
     let mut walk = Walk { stage, found, scopes: HashMap::new(), visited: 0, uses: 0 };
@@ -89,6 +97,25 @@ pub(super) fn catalogue(stage: &Stage) -> Result<Catalogue> {
         found.report.warn(error.to_string());
     }
     found.attributes = dress::attributes(&found.prims, &mut found.report);
+    let attributes = found.attributes.clone();
+    for prim in &found.prims {
+        let length = |name| {
+            stage
+                .value(&prim.path, name)
+                .and_then(|value| super::value::integers(&value))
+                .map_or(0, |all| all.len())
+        };
+        let points = if prim.parts > 1 { PART_POINTS } else { prim.points };
+        let (corners, faces) = match prim.kind {
+            Kind::Mesh => (length("faceVertexIndices"), length("faceVertexCounts")),
+            Kind::Points => (prim.points, prim.points),
+            // About as many lines as points, some curves being cut finer
+            Kind::Curves => (4 * points, 2 * points),
+        };
+        let bytes = polygons::need_memory(stage, &prim.path, points, corners, faces, &attributes)?;
+        found.memory_bytes = found.memory_bytes.max(bytes);
+    }
+    found.memory_bytes += stage.layer_bytes();
     let counts = found.assembly.counts(|inner| inner.placed);
     if counts.iter().fold(0_u64, |sum, &count| sum.saturating_add(count)) > COPIES_MAX {
         let message = format!("more than {COPIES_MAX} copies of prototypes");
@@ -265,6 +292,10 @@ impl Walk<'_> {
                     || self.stage.value(path, "normals").is_some();
                 let points = self.stage.value(path, "points").and_then(|value| super::value::vectors(&value));
                 let points = points.map_or(0, |points| points.len());
+                let materials = match kind {
+                    Kind::Mesh => material::see_through(self.stage, path),
+                    _ => Vec::new(),
+                };
                 let path = path.to_owned();
                 // Scope and sharing are known once the scope is complete
                 let (scope, is_shared) = (0, false);
@@ -275,7 +306,9 @@ impl Walk<'_> {
                     scope_from_prim,
                     primvars,
                     points,
+                    parts: if kind == Kind::Curves { points.div_ceil(PART_POINTS).max(1) } else { 1 },
                     has_normals,
+                    materials,
                     is_shared,
                 });
             }
