@@ -28,7 +28,7 @@ fn fill(elements: &mut Elements<'_>, n: u32, place: DVec3) -> ImportReport {
             arity: 0,
             material: 0,
             object: i % 3,
-            opacity: if i % 5 == 0 { 9 } else { 255 },
+            opacity: if i.is_multiple_of(5) { 9 } else { 255 },
         };
         let corners = match i % 11 {
             0 => &quad[..3],

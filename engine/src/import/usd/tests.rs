@@ -446,7 +446,7 @@ fn many_curves_are_read_in_parts() {
         format!("({x},{y},0),({x},{y},1)")
     });
     let points = points.collect::<Vec<_>>().join(",");
-    let widths = (0..count).map(|i| if i % 2 == 0 { "0.5,0.125" } else { "0.25,0.0625" });
+    let widths = (0..count).map(|i: usize| if i.is_multiple_of(2) { "0.5,0.125" } else { "0.25,0.0625" });
     let widths = widths.collect::<Vec<_>>().join(",");
     let counts = vec!["2"; count].join(",");
     let text = format!(
@@ -475,7 +475,7 @@ fn many_curves_are_read_in_parts() {
             assert_eq!(p, p.round());
             let i = p.y as usize * 600 + p.x as usize;
             assert!(!std::mem::replace(&mut seen[i], true));
-            let wide = if i % 2 == 0 { 0.25 } else { 0.125 };
+            let wide = if i.is_multiple_of(2) { 0.25 } else { 0.125 };
             let radii = [root, tip].map(|v| grid.value(&sink.schema, radius, v, 0));
             assert_eq!(radii, [wide, wide / 4.0]);
         }
