@@ -3,8 +3,8 @@
 //! Import → brick map → batches → cut, trace, shade → merge. Each step leaves its result in the bake's folder, so an
 //! interrupted bake continues where it was, and the result is the same bytes. A farm orders the same steps as tasks.
 
-pub mod copies;
-mod folder;
+mod copies;
+pub mod folder;
 pub mod frames;
 pub mod inputs;
 pub mod map;
