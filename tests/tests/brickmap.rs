@@ -47,7 +47,7 @@ fn build_at(target: &Path, threads: usize, memory_bytes: u64, cancel: bool) -> e
     };
     let [mut fine, mut coarse] = scene();
     let streams: [&mut dyn MicrogridStream; 2] = [&mut fine, &mut coarse];
-    let mut occluders = streams.map(|stream| OccluderStream::once(stream));
+    let mut occluders = streams.map(OccluderStream::once);
     let result = build(&mut occluders, &options, target, &|_, _| {}, &AtomicBool::new(cancel)).map(|_| ());
     assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "temporary data is left behind");
     result
