@@ -4,8 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use engine::bake::Control;
-use engine::relight::{Environment, Picture, RelightOptions, Viewpoint, find_attribute, relight};
-use engine::scene::{self, Camera, Domain, UpAxis, Weight};
+use engine::relight::{
+    Environment, Picture, RelightOptions, Viewpoint, find_attribute, noted, noted_attribute, relight,
+};
+use engine::scene::{self, Camera, UpAxis, Weight};
 use engine::stream::MicrogridStream;
 use engine::stream::file::MgsReader;
 use engine::{Error, ErrorKind, Result};
@@ -130,21 +132,11 @@ pub fn draw(
 
 /// Weight and domain as the bake noted them in the stream.
 pub fn learn_how_it_was_baked(reader: &MgsReader, options: &mut RelightOptions) -> Result<()> {
-    let column = find_attribute(reader.schema(), options.attribute.as_deref())?;
-    let attribute = &reader.schema().attributes[column].name;
-    let noted = |what: &str| {
-        let key = format!("{attribute}.{what}");
-        reader.metadata().iter().find(|(name, _)| *name == key).map(|(_, value)| value.as_str())
-    };
-    match noted("weight") {
-        Some("cosine") => options.weight = Weight::Cosine,
-        _ => options.weight = Weight::Uniform,
+    if options.attribute.is_none() {
+        options.attribute = noted_attribute(reader.metadata()).map(str::to_owned);
     }
-    options.domain = match noted("domain") {
-        Some("hemisphere") => Some(Domain::Hemisphere),
-        Some("sphere") => Some(Domain::Sphere),
-        _ => None,
-    };
+    let column = find_attribute(reader.schema(), options.attribute.as_deref())?;
+    (options.weight, options.domain) = noted(reader.metadata(), &reader.schema().attributes[column].name);
     Ok(())
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Read the modules in the order of the path of the data:
 //! [`scene`] → [`import`] → [`dice`] → [`stream`] → [`brick`], [`brickmap`] → [`batch`] → [`cut`] → [`trace`] →
-//! [`shade`] → [`output`] → [`relight`]. [`bake`] is the only file that names them all.
+//! [`shade`] → [`output`] → [`relight`] → [`preview`]. [`bake`] is the only file that names them all.
 //!
 //! The engine knows no network, no async runtime and no database.
 
@@ -16,6 +16,7 @@ pub mod error;
 pub mod import;
 pub mod math;
 pub mod output;
+pub mod preview;
 pub mod relight;
 pub mod scene;
 pub mod shade;

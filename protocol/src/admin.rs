@@ -164,3 +164,30 @@ pub struct GcReport {
     /// Bytes of all of these.
     pub bytes: u64,
 }
+
+/// A browser signs in with a token.
+#[derive(Clone, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SignInRequest {
+    /// The token's secret.
+    pub token: String,
+}
+
+/// Who a browser is signed in as.
+#[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
+pub struct SessionDetail {
+    /// The token's label.
+    pub name: String,
+    /// What it may do.
+    pub role: Role,
+    /// The only project that it may see and change.
+    pub project: Option<String>,
+    /// When it ends; none where everybody may do everything without a token.
+    pub expires_at: Option<i64>,
+    /// What every change must send in the header `X-Pantaray-CSRF`.
+    pub csrf: String,
+    /// The coordinator's version.
+    pub version: String,
+    /// Milliseconds since 1970 by the coordinator's clock.
+    pub now: i64,
+}

@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::overview::JobNow;
 use crate::states::{BatchState, FailureClass, JobState, PassKind, PassState, WaitReason};
+use crate::work::PassResult;
 
 /// How to bake, as `pantaray bake` has it; words that only the engine understands are checked when a job is submitted.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -198,6 +200,12 @@ pub struct JobSummary {
 pub struct JobPage {
     /// Jobs.
     pub jobs: Vec<JobSummary>,
+    /// Jobs of all pages.
+    #[serde(default)]
+    pub total: i64,
+    /// What those of the page do at this moment that have not ended.
+    #[serde(default)]
+    pub live: BTreeMap<String, JobNow>,
     /// The cursor of the next page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<String>,
@@ -246,6 +254,9 @@ pub struct PassDetail {
     pub created_at: i64,
     /// When it ended.
     pub ended_at: Option<i64>,
+    /// What it found out.
+    #[serde(default)]
+    pub result: Option<PassResult>,
 }
 
 /// A segment of a pass.
@@ -393,4 +404,10 @@ pub struct Output {
     pub points: u64,
     /// Points with a result.
     pub baked: u64,
+    /// Whether there is a preview, for the dashboard's viewer.
+    #[serde(default)]
+    pub preview: bool,
+    /// Whether there is a picture.
+    #[serde(default)]
+    pub picture: bool,
 }

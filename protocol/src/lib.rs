@@ -10,6 +10,7 @@ pub mod events;
 pub mod job;
 pub mod keys;
 pub mod limits;
+pub mod overview;
 pub mod problem;
 pub mod states;
 pub mod storage;

@@ -239,6 +239,12 @@ pub enum PassResult {
         baked: u64,
         /// Bytes of the file.
         bytes: u64,
+        /// Whether a preview lies beside it.
+        #[serde(default)]
+        preview: bool,
+        /// Whether a picture lies beside it.
+        #[serde(default)]
+        picture: bool,
     },
 }
 

@@ -242,6 +242,27 @@ pub fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
         .ok_or_else(|| Error::new(ErrorKind::NotFound, "no attribute is named `sh_occlusion`").hint(listed()))
 }
 
+/// The first attribute of visibility coefficients that a stream's metadata names; none where it names none.
+pub fn noted_attribute(metadata: &[(String, String)]) -> Option<&str> {
+    let baked = |(key, value): &'_ (String, String)| value == "sh_occlusion" && key.ends_with(".shader");
+    metadata.iter().find(|entry| baked(entry)).and_then(|(key, _)| key.strip_suffix(".shader"))
+}
+
+/// How an attribute was baked, as its stream's metadata says: weight, and domain where that is said.
+pub fn noted(metadata: &[(String, String)], attribute: &str) -> (Weight, Option<Domain>) {
+    let noted = |what: &str| {
+        let key = format!("{attribute}.{what}");
+        metadata.iter().find(|(name, _)| *name == key).map(|(_, value)| value.as_str())
+    };
+    let weight = if noted("weight") == Some("cosine") { Weight::Cosine } else { Weight::Uniform };
+    let domain = match noted("domain") {
+        Some("hemisphere") => Some(Domain::Hemisphere),
+        Some("sphere") => Some(Domain::Sphere),
+        _ => None,
+    };
+    (weight, domain)
+}
+
 /// The box of all vertices that were baked. Leaves the stream at its end.
 fn baked_bounds(stream: &mut dyn MicrogridStream, progress: &mut dyn FnMut(f64)) -> Result<Bounds> {
     let schema = stream.schema().clone();

@@ -4,6 +4,7 @@
 //! wasteful, and none needs to be the leader when another dies.
 
 pub mod bytes;
+pub mod pace;
 mod publish;
 pub mod submit;
 mod tick;
@@ -57,6 +58,8 @@ pub struct Coordinator {
     tasks: Mutex<HashMap<i64, Arc<Task>>>,
     /// The assets that a job's scene refers to, of the jobs that were asked for lately.
     assets: Mutex<HashMap<String, Arc<HashSet<String>>>>,
+    /// How fast jobs go.
+    pub pace: pace::Pace,
     /// What happens, for listeners.
     pub events: broadcast::Sender<Event>,
     last_event: AtomicI64,
@@ -97,6 +100,7 @@ impl Coordinator {
             sessions: Mutex::default(),
             tasks: Mutex::default(),
             assets: Mutex::default(),
+            pace: pace::Pace::default(),
             events: broadcast::channel(EVENTS_MAX).0,
             last_event,
             stopping: AtomicBool::new(false),

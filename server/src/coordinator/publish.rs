@@ -15,12 +15,15 @@ impl Coordinator {
     /// Writes the manifest. Done twice, it writes the same bytes.
     pub(super) async fn publish(&self, publication: &Publication) -> Result<()> {
         let output = |(set, folder, sha256, result): &(String, String, String, PassResult)| {
-            let (points, baked, bytes) = match *result {
-                PassResult::Merge { points, baked, bytes } => (points, baked, bytes),
-                _ => (0, 0, 0),
+            let (points, baked, bytes, preview, picture) = match *result {
+                PassResult::Merge { points, baked, bytes, preview, picture } => {
+                    (points, baked, bytes, preview, picture)
+                }
+                _ => (0, 0, 0, false, false),
             };
             let name = format!("{set}.mgs");
-            Output { key: format!("{folder}/{name}"), name, sha256: sha256.clone(), bytes, points, baked }
+            let (key, sha256) = (format!("{folder}/{name}"), sha256.clone());
+            Output { key, name, sha256, bytes, points, baked, preview, picture }
         };
         let manifest = Manifest {
             version: VERSION,

@@ -19,11 +19,13 @@ pub struct Token {
     pub worker: Option<String>,
     /// Labels that its worker gets.
     pub labels: Vec<String>,
+    /// The token that a browser signed in with, where this is the session of one.
+    pub parent: Option<String>,
 }
 
 const TOKEN: &str =
     "SELECT id, role, project, label, created_at, expires_at, revoked_at, last_used_at, sha256, worker,
-    labels FROM token";
+    labels, parent FROM token";
 
 fn token(row: &Row) -> Result<Token> {
     Ok(Token {
@@ -40,6 +42,7 @@ fn token(row: &Row) -> Result<Token> {
         sha256: row.text(8)?,
         worker: row.text_or_null(9)?,
         labels: serde_json::from_str(&row.text(10)?)?,
+        parent: row.text_or_null(11)?,
     })
 }
 
@@ -51,8 +54,8 @@ impl Store {
     pub async fn add_token(&self, token: &Token) -> Result<()> {
         let mut tx = self.begin().await?;
         let sql =
-            "INSERT INTO token (id, sha256, role, project, worker, labels, label, created_at, expires_at)
-            VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
+            "INSERT INTO token (id, sha256, role, project, worker, labels, label, created_at, expires_at, parent)
+            VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)";
         let detail = &token.detail;
         let values = values![
             &detail.id,
@@ -63,7 +66,8 @@ impl Store {
             serde_json::to_string(&token.labels)?,
             &detail.label,
             detail.created_at,
-            detail.expires_at
+            detail.expires_at,
+            token.parent.clone()
         ];
         tx.execute(sql.into(), values).await?;
         self.commit("token", tx).await
@@ -78,12 +82,14 @@ impl Store {
         row.as_ref().map(token).transpose()
     }
 
-    /// All tokens, latest first.
+    /// All tokens but sessions, latest first.
     ///
     /// # Errors
     /// When the database refuses.
     pub async fn tokens(&self) -> Result<Vec<TokenDetail>> {
-        let rows = self.query(format!("{TOKEN} ORDER BY created_at DESC, id LIMIT 1000"), vec![]).await?;
+        let rows = self
+            .query(format!("{TOKEN} WHERE parent IS NULL ORDER BY created_at DESC, id LIMIT 1000"), vec![])
+            .await?;
         rows.iter().map(|row| token(row).map(|token| token.detail)).collect()
     }
 
@@ -95,17 +101,28 @@ impl Store {
         Ok(self.query_one("SELECT id FROM token LIMIT 1", vec![]).await?.is_some())
     }
 
-    /// Revokes a token.
+    /// Revokes a token and the sessions that were made from it.
     ///
     /// # Errors
     /// [`Kind::NotFound`].
     pub async fn revoke_token(&self, id: &str, now: i64) -> Result<()> {
         let mut tx = self.begin().await?;
-        let sql = "UPDATE token SET revoked_at = COALESCE(revoked_at, $2) WHERE id = $1";
+        let sql = "UPDATE token SET revoked_at = COALESCE(revoked_at, $2) WHERE id = $1 OR parent = $1";
         if tx.execute(sql.into(), values![id, now]).await? == 0 {
             return Err(Error::not_found("token", id));
         }
         self.commit("revoke", tx).await
+    }
+
+    /// Forgets sessions that have expired.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn forget_sessions(&self, now: i64) -> Result<()> {
+        let mut tx = self.begin().await?;
+        let sql = "DELETE FROM token WHERE parent IS NOT NULL AND (expires_at < $1 OR revoked_at < $1)";
+        tx.execute(sql.into(), values![now]).await?;
+        self.commit("sessions", tx).await
     }
 
     /// Notes that a token was used.

@@ -46,6 +46,14 @@ struct Saved {
     key: String,
 }
 
+/// What a pass found out, from the text that the database has.
+///
+/// # Errors
+/// When the text is no result.
+pub(super) fn found_out(saved: &str) -> Result<PassResult> {
+    Ok(serde_json::from_str::<Saved>(saved)?.result)
+}
+
 /// What is known of a job besides its graph.
 struct Head {
     id: String,

@@ -5,10 +5,16 @@ use crate::error::Kind;
 use crate::{Error, Result, values};
 
 /// For each version, from 1: SQLite's script and PostgreSQL's.
-const MIGRATIONS: [(&str, &str); 1] = [(
-    include_str!("../../../migrations/sqlite/0001_queue.sql"),
-    include_str!("../../../migrations/postgres/0001_queue.sql"),
-)];
+const MIGRATIONS: [(&str, &str); 2] = [
+    (
+        include_str!("../../../migrations/sqlite/0001_queue.sql"),
+        include_str!("../../../migrations/postgres/0001_queue.sql"),
+    ),
+    (
+        include_str!("../../../migrations/sqlite/0002_session.sql"),
+        include_str!("../../../migrations/postgres/0002_session.sql"),
+    ),
+];
 
 /// Takes the steps that are missing, each in one transaction.
 pub(super) async fn run(store: &Store) -> Result<()> {

@@ -15,6 +15,7 @@ pub mod farm;
 pub mod graph;
 pub mod job;
 pub mod lease;
+pub mod list;
 mod migrate;
 pub mod postgres;
 pub mod sqlite;

@@ -1,29 +1,27 @@
 //! Jobs, passes, batches and workers as people see them: bounded pages, no transaction.
 
 use protocol::admin::WorkerDetail;
-use protocol::job::{
-    BatchDetail, BatchPage, Counts, Failure, JobPage, JobSummary, PassDetail, SegmentDetail,
-};
+use protocol::job::{BatchDetail, BatchPage, Counts, Failure, JobSummary, PassDetail, SegmentDetail};
 use protocol::{BatchState, FailureClass, JobState, PassKind, PassState};
 
-use super::{Row, Store};
+use super::{Row, Store, graph};
 use crate::scheduler::farm::WORKER_LOST_MS;
 use crate::{Error, Result, values};
 
 /// A job's columns; its batches are those of its bake passes.
-const SUMMARY: &str =
+pub(super) const SUMMARY: &str =
     "SELECT j.id, j.name, j.project, j.state, j.paused, j.reason, j.priority, j.submitted_by, j.shot,
     j.frame, j.comment, j.created_at, j.started_at, j.ended_at, j.version,
     COALESCE(c.r, 0), COALESCE(c.l, 0), COALESCE(c.d, 0), COALESCE(c.f, 0), COALESCE(c.k, 0)";
 
 /// The counts of the bake passes of the jobs in a list.
-const COUNTS: &str = "LEFT JOIN (SELECT p.job_id AS job, CAST(SUM(s.n_ready) AS BIGINT) AS r,
+pub(super) const COUNTS: &str = "LEFT JOIN (SELECT p.job_id AS job, CAST(SUM(s.n_ready) AS BIGINT) AS r,
         CAST(SUM(s.n_leased) AS BIGINT) AS l, CAST(SUM(s.n_done) AS BIGINT) AS d,
         CAST(SUM(s.n_failed) AS BIGINT) AS f, CAST(SUM(s.n_skipped) AS BIGINT) AS k
     FROM pass p JOIN segment s ON s.pass_id = p.id WHERE p.kind = 3 AND p.job_id IN (SELECT id FROM page)
     GROUP BY p.job_id) AS c ON c.job = j.id";
 
-fn summary(row: &Row) -> Result<JobSummary> {
+pub(super) fn summary(row: &Row) -> Result<JobSummary> {
     Ok(JobSummary {
         id: row.text(0)?,
         name: row.text(1)?,
@@ -55,29 +53,6 @@ fn counts(row: &Row, first: usize) -> Result<Counts> {
 }
 
 impl Store {
-    /// Jobs before the job `before`, latest first, of one project and in one state where given.
-    ///
-    /// # Errors
-    /// When the database refuses.
-    pub async fn jobs(
-        &self,
-        project: Option<&str>,
-        state: Option<JobState>,
-        before: Option<&str>,
-        limit: i64,
-    ) -> Result<JobPage> {
-        let state = state.map_or(-1, JobState::code);
-        let (project, before) = (project.unwrap_or_default(), before.unwrap_or("~"));
-        let sql = format!(
-            "WITH page AS (SELECT id FROM job WHERE id < $1 AND ($2 = '' OR project = $2) AND ($3 = -1 OR state = $3)
-                ORDER BY id DESC LIMIT $4) {SUMMARY} FROM page JOIN job j ON j.id = page.id {COUNTS} ORDER BY j.id DESC"
-        );
-        let rows = self.query(sql, values![before, project, state, limit]).await?;
-        let jobs = rows.iter().map(summary).collect::<Result<Vec<_>>>()?;
-        let next = if jobs.len() as i64 == limit { jobs.last().map(|job| job.id.clone()) } else { None };
-        Ok(JobPage { jobs, next })
-    }
-
     /// A job.
     ///
     /// # Errors
@@ -104,13 +79,13 @@ impl Store {
     /// # Errors
     /// When the database refuses.
     pub async fn pass_details(&self, job: &str) -> Result<Vec<PassDetail>> {
-        let sql = "SELECT p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at,
+        let sql = "SELECT p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result,
                 CAST(COALESCE(SUM(s.n_ready), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_leased), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.n_done), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_failed), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT)
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
-            GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at ORDER BY p.id";
+            GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result ORDER BY p.id";
         let pass = |row: &Row| {
             Ok(PassDetail {
                 id: row.int(0)?,
@@ -120,8 +95,9 @@ impl Store {
                 reused: row.flag(4)?,
                 created_at: row.int(5)?,
                 ended_at: row.int_or_null(6)?,
-                batches: counts(row, 7)?,
-                batch_ms: row.int(12)?,
+                result: row.text_or_null(7)?.as_deref().map(graph::found_out).transpose()?,
+                batches: counts(row, 8)?,
+                batch_ms: row.int(13)?,
             })
         };
         self.query(sql, values![job]).await?.iter().map(pass).collect()

@@ -14,7 +14,7 @@ use axum::response::{IntoResponse, Response};
 use protocol::Role;
 use protocol::admin::AuditEntry;
 
-use super::Api;
+use super::{Api, session};
 use crate::coordinator::lock;
 use crate::db::access::Token;
 use crate::error::Kind;
@@ -36,9 +36,9 @@ pub type Roles = HashMap<(Method, String), Option<Role>>;
 pub struct Tokens(Mutex<HashMap<String, (Arc<Token>, i64)>>);
 
 impl Tokens {
-    /// Forgets a token: it was revoked.
+    /// Forgets a token and its sessions: it was revoked.
     pub fn forget(&self, id: &str) {
-        lock(&self.0).remove(id);
+        lock(&self.0).retain(|known, (token, _)| known != id && token.parent.as_deref() != Some(id));
     }
 }
 
@@ -110,7 +110,11 @@ pub async fn guard(State(api): State<Arc<Api>>, mut request: Request, next: Next
     };
     let address = request.extensions().get::<ConnectInfo<SocketAddr>>();
     let address = address.map_or_else(String::new, |ConnectInfo(address)| address.ip().to_string());
-    let secret = bearer(request.headers()).map(str::to_owned);
+    // Where nobody is asked who they are, a cookie that is left over is in nobody's way
+    let secret = match needed.map_or(Ok(None), |_| secret(&method, request.headers())) {
+        Ok(secret) => secret.map(str::to_owned),
+        Err(error) => return error.into_response(),
+    };
     let caller = match api.admit(secret, address, needed).await {
         Ok(caller) => caller,
         Err(error) => return error.into_response(),
@@ -195,6 +199,24 @@ impl Api {
 /// Compares hashes in a time that does not depend on where they differ.
 fn same(a: &str, b: &str) -> bool {
     a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
+}
+
+/// The secret of a request: a header's, or else that of a browser's session, which cannot change anything unless the
+/// page itself asks.
+fn secret<'a>(method: &Method, headers: &'a HeaderMap) -> Result<Option<&'a str>> {
+    if let Some(secret) = bearer(headers) {
+        return Ok(Some(secret));
+    }
+    let Some(secret) = session::cookie(headers) else { return Ok(None) };
+    let asked_by_page = || {
+        let sent = headers.get(session::CSRF_HEADER).and_then(|value| value.to_str().ok());
+        sent.is_some_and(|sent| same(sent, &session::csrf(secret)))
+    };
+    if *method == Method::GET || asked_by_page() {
+        return Ok(Some(secret));
+    }
+    let message = format!("a change by a session needs the header `{}`", session::CSRF_HEADER);
+    Err(Error::new(Kind::Forbidden, message).hint("`GET /v1/session` says its value"))
 }
 
 fn bearer(headers: &HeaderMap) -> Option<&str> {

@@ -101,7 +101,7 @@ pub async fn make_token(store: &Store, request: &TokenRequest, now: i64) -> Resu
         last_used_at: None,
     };
     let sha256 = sha256(secret.as_bytes());
-    store.add_token(&Token { detail, sha256, worker: None, labels: Vec::new() }).await?;
+    store.add_token(&Token { detail, sha256, worker: None, labels: Vec::new(), parent: None }).await?;
     Ok(Secret { id, secret })
 }
 
@@ -202,7 +202,7 @@ pub async fn enrol(State(api): State<Arc<Api>>, Json(request): Json<EnrolRequest
         last_used_at: None,
     };
     let sha256 = sha256(secret.as_bytes());
-    store.add_token(&Token { detail, sha256, worker: Some(request.name), labels }).await?;
+    store.add_token(&Token { detail, sha256, worker: Some(request.name), labels, parent: None }).await?;
     Ok(Json(Secret { id, secret }))
 }
 

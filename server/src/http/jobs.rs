@@ -15,7 +15,9 @@ use utoipa::IntoParams;
 use super::Api;
 use super::access::Caller;
 use super::extract::{Json, Path, Query};
+use super::overview::live;
 use crate::coordinator::submit::Submitter;
+use crate::db::list::{JobList, JobSort};
 use crate::scheduler::waiting::{Question, reason};
 use crate::{Error, Result};
 
@@ -30,6 +32,18 @@ pub struct JobsQuery {
     project: Option<String>,
     /// In one state.
     state: Option<JobState>,
+    /// Whose name, owner, shot, comment or id holds this.
+    #[serde(default)]
+    search: String,
+    /// What to sort by: `created` unless said otherwise.
+    #[serde(default)]
+    #[param(inline)]
+    sort: JobSort,
+    /// `asc`: least first. Otherwise the greatest, or latest.
+    order: Option<String>,
+    /// Entries to leave out before the page.
+    #[serde(default)]
+    offset: i64,
     /// The cursor: `next` of the page before.
     after: Option<String>,
     /// Entries at most.
@@ -98,7 +112,7 @@ pub async fn validate(
     api.coordinator.estimate(&request).await.map(Json)
 }
 
-/// Jobs, latest first.
+/// Jobs, latest first unless another order is asked for.
 #[utoipa::path(get, path = "/v1/jobs", tag = "jobs", security(("token" = ["viewer"])), params(JobsQuery),
     responses((status = 200, body = JobPage)))]
 pub async fn jobs(
@@ -107,8 +121,19 @@ pub async fn jobs(
     Query(query): Query<JobsQuery>,
 ) -> Result<Json<JobPage>> {
     let project = caller.project_or(query.project.as_deref())?;
-    let jobs = api.coordinator.store.jobs(project, query.state, query.after.as_deref(), page(query.limit));
-    jobs.await.map(Json)
+    let list = JobList {
+        project,
+        state: query.state,
+        search: limits::cut(query.search.trim(), limits::NAME_BYTES_MAX),
+        sort: query.sort,
+        ascending: query.order.as_deref() == Some("asc"),
+        before: query.after.as_deref(),
+        offset: query.offset.max(0),
+        limit: page(query.limit),
+    };
+    let mut page = api.coordinator.store.jobs(&list).await?;
+    page.live = live(&api.coordinator, &page.jobs);
+    Ok(Json(page))
 }
 
 /// A job in full: its passes, why it waits, the time left.

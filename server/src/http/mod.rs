@@ -9,6 +9,8 @@ mod events;
 mod extract;
 mod health;
 mod jobs;
+mod overview;
+mod session;
 #[cfg(test)]
 mod tests;
 mod work;
@@ -45,6 +47,7 @@ pub struct Api {
     metrics: PrometheusHandle,
     /// The minute, and enrolments that failed in it.
     failed_enrolments: Mutex<(i64, u32)>,
+    sign_ins: session::SignIns,
 }
 
 /// Every operation.
@@ -78,9 +81,19 @@ fn operations() -> OpenApiRouter<Arc<Api>> {
         .routes(routes!(bytes::output))
         .routes(routes!(bytes::log))
         .routes(routes!(events::events))
+        // The farm at a glance, and what of a bake is for the eye
+        .routes(routes!(overview::farm))
+        .routes(routes!(overview::leases))
+        .routes(routes!(overview::pace))
+        .routes(routes!(overview::job_picture))
+        .routes(routes!(overview::picture))
+        .routes(routes!(overview::preview))
+        .routes(routes!(overview::skies))
         // Assets
         .routes(routes!(bytes::missing_assets))
         .routes(routes!(bytes::put_asset))
+        // Sessions of browsers
+        .routes(routes!(session::sign_in, session::session, session::sign_out))
         // Administrators
         .routes(routes!(admin::act_on_worker))
         .routes(routes!(admin::create_token, admin::tokens))
@@ -153,10 +166,12 @@ pub fn router(coordinator: Arc<Coordinator>) -> Router {
         openapi: format!("{document:#}\n"),
         metrics: health::metrics_handle(),
         failed_enrolments: Mutex::default(),
+        sign_ins: session::SignIns::default(),
     });
     let unknown = async |request: Request| Error::not_found("operation", request.uri().path());
     router
         .route_layer(middleware::from_fn_with_state(api.clone(), guard))
+        .merge(crate::dashboard::router())
         .layer(DefaultBodyLimit::max(limits::REQUEST_BYTES_MAX))
         .fallback(unknown)
         .with_state(api)
@@ -174,6 +189,7 @@ pub async fn serve(
     let router = router(coordinator.clone()).into_make_service_with_connect_info::<SocketAddr>();
     let loops = tokio::spawn(coordinator.clone().run());
     let events = tokio::spawn(coordinator.clone().pass_events_on());
+    let pace = tokio::spawn(coordinator.clone().note_pace());
     let (ended, late) = tokio::sync::oneshot::channel::<()>();
     let stopping = coordinator.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(async move {
@@ -191,7 +207,7 @@ pub async fn serve(
         () = too_late => tracing::warn!("requests were still under way {GRACE:?} after the end was asked for"),
     }
     coordinator.stop();
-    let _ = tokio::join!(loops, events);
+    let _ = tokio::join!(loops, events, pace);
     coordinator.store.driver().close().await;
     Ok(())
 }

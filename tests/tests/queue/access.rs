@@ -26,7 +26,7 @@ async fn tokens_and_tickets_end(queue: Queue) {
         revoked_at: None,
         last_used_at: None,
     };
-    let token = Token { detail, sha256: "x".into(), worker: None, labels: vec![] };
+    let token = Token { detail, sha256: "x".into(), worker: None, labels: vec![], parent: None };
     assert!(!queue.store.has_tokens().await.unwrap());
     queue.store.add_token(&token).await.unwrap();
     let found = queue.store.token("t").await.unwrap().unwrap();

@@ -2,6 +2,7 @@
 
 use protocol::work::PassResult;
 use protocol::{JobState, PassKind, PassState};
+use server::db::list::JobList;
 
 use crate::{Queue, all_done, built, import, new_job, on_both};
 
@@ -27,7 +28,7 @@ async fn a_job_comes_to_its_end(queue: Queue) {
         queue.complete("w1", bake.pass, &granted, &all_done(&granted)).await;
     }
     queue.advance("j").await;
-    let result = PassResult::Merge { points: 50, baked: 50, bytes: 1234 };
+    let result = PassResult::Merge { points: 50, baked: 50, bytes: 1234, preview: false, picture: false };
     let merge = queue.pass("j", PassKind::Merge).await;
     let granted = queue.claim("w1", merge, 0, 1).await.unwrap();
     let mut items = all_done(&granted);
@@ -98,7 +99,7 @@ async fn the_same_request_makes_one_job(queue: Queue) {
     let mut other = new_job("e", Some("key"));
     other.request_sha256 = "another".into();
     assert!(queue.store.submit(&[other], 5).await.is_err());
-    assert_eq!(queue.store.jobs(None, None, None, 10).await.unwrap().jobs.len(), 1);
+    assert_eq!(queue.store.jobs(&JobList { limit: 10, ..JobList::default() }).await.unwrap().jobs.len(), 1);
 }
 
 async fn dependencies_hold_jobs_back(queue: Queue) {

@@ -2,6 +2,7 @@
 
 use protocol::job::{BatchSelection, JobPatch};
 use protocol::{FailureClass, JobState, PassState};
+use server::db::list::{JobList, JobSort};
 
 use crate::{Queue, all_done, on_both};
 
@@ -14,6 +15,9 @@ on_both! {
     paused_jobs_wait
     /// Catches pages that miss a job or show it twice.
     pages_hold_every_job_once
+    /// Catches an order that is not the one asked for, pages that overlap in it, a search that finds too much or too
+    /// little, and a total that counts the page.
+    lists_are_sorted_searched_and_counted
     /// Catches changes of what is over.
     what_is_over_stays_so
 }
@@ -73,8 +77,7 @@ async fn pages_hold_every_job_once(queue: Queue) {
     }
     let (mut seen, mut before) = (Vec::new(), None::<String>);
     loop {
-        let page =
-            queue.store.jobs(Some("default"), Some(JobState::Ready), before.as_deref(), 5).await.unwrap();
+        let page = queue.store.jobs(&JobList { before: before.as_deref(), ..list("default") }).await.unwrap();
         seen.extend(page.jobs.into_iter().map(|job| job.id));
         before = page.next;
         if before.is_none() {
@@ -82,7 +85,33 @@ async fn pages_hold_every_job_once(queue: Queue) {
         }
     }
     assert_eq!(seen, (0..23).rev().map(|number| format!("j{number:02}")).collect::<Vec<_>>());
-    assert!(queue.store.jobs(Some("other"), None, None, 5).await.unwrap().jobs.is_empty());
+    assert!(queue.store.jobs(&list("other")).await.unwrap().jobs.is_empty());
+}
+
+fn list(project: &str) -> JobList<'_> {
+    JobList { project: Some(project), state: Some(JobState::Ready), limit: 5, ..JobList::default() }
+}
+
+async fn lists_are_sorted_searched_and_counted(queue: Queue) {
+    for number in 0..12 {
+        queue.submit(&format!("j{number:02}")).await;
+        let patch = JobPatch { priority: Some(number % 4), ..JobPatch::default() };
+        queue.store.patch(&format!("j{number:02}"), &patch, "tester", queue.now).await.unwrap();
+    }
+    let sorted = JobList { sort: JobSort::Priority, ascending: true, ..list("default") };
+    let mut seen = Vec::new();
+    for offset in [0, 5, 10, 15] {
+        let page = queue.store.jobs(&JobList { offset, ..sorted.clone() }).await.unwrap();
+        assert_eq!((page.total, page.next), (12, None));
+        seen.extend(page.jobs.into_iter().map(|job| (job.priority, job.id)));
+    }
+    let mut wanted: Vec<(i64, String)> = (0..12).map(|n| (n % 4, format!("j{n:02}"))).collect();
+    wanted.sort_by(|a, b| a.0.cmp(&b.0).then(b.1.cmp(&a.1)));
+    assert_eq!(seen, wanted);
+    let found = queue.store.jobs(&JobList { search: "J1", ..list("default") }).await.unwrap();
+    let found: Vec<&str> = found.jobs.iter().map(|job| job.id.as_str()).collect();
+    assert_eq!(found, ["j11", "j10"]);
+    assert_eq!(queue.store.jobs(&JobList { search: "j%1", ..list("default") }).await.unwrap().total, 0);
 }
 
 async fn what_is_over_stays_so(queue: Queue) {

@@ -16,7 +16,7 @@ fn machine() -> BakeOptions {
     BakeOptions { memory_bytes: 256 << 20, threads: 1, ..BakeOptions::default() }
 }
 
-fn options(client: Client, name: &str, folder: &Path) -> Options {
+pub fn options(client: Client, name: &str, folder: &Path) -> Options {
     Options {
         client,
         name: name.into(),
@@ -31,7 +31,7 @@ fn options(client: Client, name: &str, folder: &Path) -> Options {
 }
 
 /// What one process makes of the scene.
-fn quiet_bake(folder: &Path) {
+pub fn quiet_bake(folder: &Path) {
     std::fs::create_dir_all(folder.join("models")).unwrap();
     std::fs::write(folder.join("scene.xml"), SCENE).unwrap();
     std::fs::write(folder.join("models/tent.obj"), TENT).unwrap();
@@ -83,6 +83,7 @@ fn a_farm_bakes_what_one_process_bakes() {
                 part.headers.insert("range".into(), "bytes=10-29".into());
                 people.download(&part, &path, 1 << 30).unwrap();
                 assert_eq!(std::fs::read(&path).unwrap(), wanted[10..30]);
+                see(&people, job, output, &path);
             }
         }
         assert_eq!(built, 2, "two maps, each built once");
@@ -97,6 +98,21 @@ fn a_farm_bakes_what_one_process_bakes() {
             assert_eq!(service.coordinator.store.orphans().await.unwrap(), 0);
         });
     });
+}
+
+/// Catches a result without preview or picture, and a preview that is not of all its points.
+fn see(people: &Client, job: &str, output: &protocol::job::Output, path: &Path) {
+    assert!(output.preview && output.picture, "{output:?}");
+    let url = |what: &str| people.own(&format!("/v1/jobs/{job}/outputs/{}/{what}", output.name));
+    people.download(&url("preview"), path, 1 << 30).unwrap();
+    let mut preview = engine::preview::Preview::open(path).unwrap();
+    assert_eq!((preview.header.points, preview.header.baked), (output.baked, output.baked));
+    let mut bytes = Vec::new();
+    (0..preview.nodes.len()).for_each(|node| preview.read(node, &mut bytes).unwrap());
+    for url in [url("picture"), people.own(&format!("/v1/jobs/{job}/picture"))] {
+        people.download(&url, path, 1 << 30).unwrap();
+        assert_eq!(std::fs::read(path).unwrap()[..4], *b"\x89PNG");
+    }
 }
 
 fn wait_for(client: &Client, jobs: &[String]) {

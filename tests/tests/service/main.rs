@@ -1,10 +1,12 @@
 //! The coordinator over real HTTP on the loopback interface, with real workers where there is work.
 
 mod bakes;
+mod browser;
 mod leases;
 mod life;
 mod people;
 mod roles;
+mod sessions;
 
 use std::path::Path;
 use std::sync::Arc;

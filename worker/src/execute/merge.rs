@@ -10,7 +10,8 @@ use protocol::work::{ClaimedBatch, PartEntry, PassResult};
 use protocol::{keys, limits};
 
 use super::inputs::Reads;
-use super::{Executor, Finished, Work, need};
+use super::preview::ForTheEye;
+use super::{Executor, Finished, Work, need, preview};
 use crate::depot::{Depot, Wanted};
 use crate::{Error, Result, digest};
 
@@ -51,9 +52,12 @@ impl Executor {
         }
         let report = merged?;
         let content = digest::of_file(&target)?;
-        work.depot.write(&format!("{folder}/{name}"), &target, &content)?;
+        let key = format!("{folder}/{name}");
+        work.depot.write(&key, &target, &content)?;
         let (points, baked, bytes) = (report.points, report.baked, content.bytes);
-        Ok(Finished { content, result: PassResult::Merge { points, baked, bytes } })
+        let ForTheEye { preview, picture } =
+            preview::make(work, prepared.options.memory_bytes / 4, &target, &key)?;
+        Ok(Finished { content, result: PassResult::Merge { points, baked, bytes, preview, picture } })
     }
 }
 

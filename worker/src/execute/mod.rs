@@ -3,6 +3,7 @@
 mod bricks;
 mod inputs;
 mod merge;
+mod preview;
 #[cfg(test)]
 mod tests;
 mod trace;
