@@ -100,12 +100,20 @@ impl Farm {
         let mut command = self.pantaray();
         command.args(["serve", "--data", &self.at("data"), "--lease", "5", "--listen"]);
         command.arg(format!("127.0.0.1:{}", self.port)).args(&self.serve);
+        let before = self.times_listening();
         self.coordinator = Some(self.spawn(command, "coordinator"));
         let start = Instant::now();
-        while std::net::TcpStream::connect(("127.0.0.1", self.port)).is_err() {
+        // By what it says: another test's coordinator may have had the port a moment ago
+        while self.times_listening() == before {
             assert!(start.elapsed() < PATIENCE, "{}", self.logs());
             std::thread::sleep(Duration::from_millis(20));
         }
+    }
+
+    /// How often the coordinator has said that it listens.
+    fn times_listening(&self) -> usize {
+        let log = std::fs::read_to_string(self.at("coordinator.log")).unwrap_or_default();
+        log.matches("listening at").count()
     }
 
     /// Kills the coordinator.

@@ -155,7 +155,7 @@ impl Coordinator {
                 worker: &session.worker,
                 session: &request.session,
                 memory_bytes: session.memory_bytes,
-                has_peers: alive > 1,
+                alive,
             };
             let from_tail = candidate.locality == Locality::Steal;
             let (ttl, now) = (self.settings.lease_ttl_ms, self.now());

@@ -16,8 +16,8 @@ pub struct Claimer<'a> {
     pub session: &'a str,
     /// Memory that it may use.
     pub memory_bytes: i64,
-    /// Whether another worker could take what this one has failed at.
-    pub has_peers: bool,
+    /// Workers that are alive, this one among them: another one may take what this one has failed at.
+    pub alive: i64,
 }
 
 /// What a claim got.
@@ -62,13 +62,15 @@ impl Store {
         };
         let (job, first_of_job) = (row.text(0)?, row.int_or_null(1)?.is_none());
 
-        // Take what this worker has not failed at, if there are others who can
-        let not_mine = match claimer.has_peers {
-            true => {
+        // Take what this worker has not failed at, or what as many have failed at as there are
+        let not_mine = match claimer.alive {
+            alive @ 2.. => format!(
                 "AND (b.tries + b.lost = 0 OR NOT EXISTS (SELECT 1 FROM batch_fault f
-                    WHERE f.pass_id = b.pass_id AND f.seq = b.seq AND f.worker = $6 AND f.class <> 8))"
-            }
-            false => "AND $6 <> ''",
+                    WHERE f.pass_id = b.pass_id AND f.seq = b.seq AND f.worker = $6 AND f.class <> 8)
+                    OR {alive} <= (SELECT COUNT(DISTINCT f.worker) FROM batch_fault f
+                    WHERE f.pass_id = b.pass_id AND f.seq = b.seq AND f.class <> 8))"
+            ),
+            _ => "AND $6 <> ''".into(),
         };
         let order = if from_tail { "DESC" } else { "ASC" };
         let sql = format!(

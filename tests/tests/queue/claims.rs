@@ -20,6 +20,8 @@ on_both! {
     what_is_given_back_counts_for_nothing
     /// Catches a worker that gets a batch again at which it has just failed.
     a_worker_does_not_get_what_it_failed_at
+    /// Catches a batch that stands still since every worker of a small farm has failed at it once.
+    what_all_have_failed_at_is_tried_again
     /// Catches a batch of an earlier process that stays leased until its time is over.
     a_new_process_ends_the_leases_of_the_old
     /// Catches a merge that published a damaged part.
@@ -161,6 +163,20 @@ async fn a_worker_does_not_get_what_it_failed_at(mut queue: Queue) {
     let granted = queue.claim("w1", bake.pass, 0, 1).await.unwrap();
     queue.fail("w1", bake.pass, &granted, FailureClass::Memory).await;
     assert!(queue.claim("w2", bake.pass, 0, 9).await.is_none(), "w2 has as little");
+}
+
+async fn what_all_have_failed_at_is_tried_again(mut queue: Queue) {
+    let bake = queue.baking("j", 1).await;
+    for worker in ["w1", "w2"] {
+        let granted = queue.claim_among(2, worker, bake.pass, 0, 1).await.unwrap();
+        queue.fail(worker, bake.pass, &granted, FailureClass::TransientIo).await;
+        queue.now += 600_000;
+        if worker == "w1" {
+            assert!(queue.claim_among(2, "w1", bake.pass, 0, 1).await.is_none(), "w2 is there");
+        }
+    }
+    assert!(queue.claim_among(3, "w1", bake.pass, 0, 1).await.is_none(), "w3 is there");
+    assert!(queue.claim_among(2, "w1", bake.pass, 0, 1).await.is_some());
 }
 
 async fn a_new_process_ends_the_leases_of_the_old(queue: Queue) {

@@ -138,7 +138,19 @@ impl Queue {
     }
 
     pub(crate) async fn claim(&self, worker: &str, pass: i64, segment: i64, count: i64) -> Option<Granted> {
-        let claimer = Claimer { worker, session: worker, memory_bytes: 4 << 30, has_peers: true };
+        self.claim_among(99, worker, pass, segment, count).await
+    }
+
+    /// Claims as one of `alive` workers.
+    pub(crate) async fn claim_among(
+        &self,
+        alive: i64,
+        worker: &str,
+        pass: i64,
+        segment: i64,
+        count: i64,
+    ) -> Option<Granted> {
+        let claimer = Claimer { worker, session: worker, memory_bytes: 4 << 30, alive };
         let candidate = Candidate { pass, segment, locality: Locality::Cold, count };
         self.store.claim(&candidate, false, &claimer, TTL, self.now).await.expect("claimed")
     }
