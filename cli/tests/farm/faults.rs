@@ -71,7 +71,7 @@ fn a_full_disk_costs_its_worker_only() {
     let job = farm.submit(1);
     farm.until_said("cramped", "File too large");
     farm.worker("other");
-    farm.wait(&job);
+    farm.wait_through_pause(&job);
     farm.expect_same(&job);
 }
 

@@ -246,6 +246,19 @@ impl Farm {
         }
     }
 
+    /// Waits for the success of a job that the coordinator may have paused, since the first worker failed at all of it before
+    /// there was another.
+    pub fn wait_through_pause(&self, job: &str) {
+        let start = Instant::now();
+        while self.command(&["jobs", job])["state"] != "succeeded" {
+            assert!(start.elapsed() < PATIENCE, "{}", self.logs());
+            if self.command(&["jobs", job])["waiting"] == "paused" {
+                self.command(&["resume", job]);
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
     /// Brings a job's stream down.
     pub fn fetch(&self, job: &str) -> (PathBuf, Vec<u8>) {
         let folder = self.at(&format!("fetched-{job}"));
