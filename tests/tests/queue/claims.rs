@@ -169,7 +169,7 @@ async fn what_all_have_failed_at_is_tried_again(mut queue: Queue) {
     let bake = queue.baking("j", 1).await;
     for worker in ["w1", "w2"] {
         let granted = queue.claim_among(2, worker, bake.pass, 0, 1).await.unwrap();
-        queue.fail(worker, bake.pass, &granted, FailureClass::TransientIo).await;
+        queue.fail(worker, bake.pass, &granted, FailureClass::Crash).await;
         queue.now += 600_000;
         if worker == "w1" {
             assert!(queue.claim_among(2, "w1", bake.pass, 0, 1).await.is_none(), "w2 is there");
