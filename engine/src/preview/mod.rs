@@ -2,7 +2,7 @@
 //! coarse first and never has all of it (`docs/formats-preview.md`).
 //!
 //! [`sample`] picks points of the stream, the same whatever the machine; [`tree`] spreads them over nodes, so that each node
-//! adds detail to those above it; [`file`] is the layout, with a reader that checks everything.
+//! adds detail to those above it; [`mod@file`] is the layout, with a reader that checks everything.
 
 pub mod file;
 mod sample;
