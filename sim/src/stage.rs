@@ -160,17 +160,26 @@ impl Stage {
         let shy = Temper { is_shy: true, wait: Duration::from_millis(200), ..Temper::default() };
         let token = self.token.clone();
         let crew = self.start_crew(&token, &[shy; 2])?;
-        let ready = jobs.iter().try_for_each(|job| {
-            self.until("the bakes are open", PATIENCE, || {
+        let mut left: Vec<&Job> = jobs.to_vec();
+        let ready = self.until("the bakes are open", PATIENCE, || {
+            let mut waiting = Vec::new();
+            for &job in &left {
                 let detail = self.client().job(&job.id)?;
                 let open = |pass: &protocol::job::PassDetail| {
                     pass.kind == PassKind::Bake && pass.state == PassState::Open
                 };
-                Ok(detail.passes.iter().any(open))
-            })
+                // Who is there waits, so that the others' turn comes soon
+                match detail.passes.iter().any(open) {
+                    true => drop(self.client().act(&job.id, "pause")?),
+                    false => waiting.push(job),
+                }
+            }
+            left = waiting;
+            Ok(left.is_empty())
         });
         crew.join()?;
-        ready
+        ready?;
+        jobs.iter().try_for_each(|job| Ok(self.client().act(&job.id, "resume").map(drop)?))
     }
 
     /// Waits until something is so.

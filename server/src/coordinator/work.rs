@@ -12,7 +12,7 @@ use protocol::work::{
 };
 
 use super::{Coordinator, lock};
-use crate::db::claim::Claimer;
+use crate::db::claim::{Claimer, Taken};
 use crate::db::complete::{Completion, Reporter};
 use crate::db::worker::Session;
 use crate::error::Kind;
@@ -28,6 +28,9 @@ const REMEMBERED_MAX: usize = 65_536;
 const EMPTY_MS: i64 = 500;
 /// The longest sleep of a claim that waits: a wake-up may have been another coordinator's to give.
 const POLL: Duration = Duration::from_secs(5);
+
+/// The first sleep of a claim that came while others had all that it could have; the next ones are longer.
+const CROWDED: Duration = Duration::from_millis(10);
 
 impl Coordinator {
     /// Makes a worker's process known; leases of its earlier processes end.
@@ -115,6 +118,7 @@ impl Coordinator {
         let deadline = Instant::now() + Duration::from_millis(request.wait_ms.min(limits::CLAIM_WAIT_MS_MAX));
         self.waiting.fetch_add(1, Ordering::Relaxed);
         let _waits = Waiting(self);
+        let mut crowded = 0;
         loop {
             if self.is_stopping() {
                 return Err(Error::new(Kind::Unavailable, "this coordinator is about to end"));
@@ -122,22 +126,28 @@ impl Coordinator {
             let mut woken = std::pin::pin!(self.wake.notified());
             woken.as_mut().enable();
             let session = self.session(&request.session, token).await?;
-            if let Some(claim) = self.try_claim(request, &session).await? {
+            let (claim, is_busy) = self.try_claim(request, &session).await?;
+            if let Some(claim) = claim {
                 metrics::counter!("pantaray_claims_total", "result" => "granted").increment(1);
                 return Ok(Some(claim));
             }
+            crowded = if is_busy { crowded + 1 } else { 0 };
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 metrics::counter!("pantaray_claims_total", "result" => "empty").increment(1);
                 return Ok(None);
             }
-            // Whoever is not woken looks again after a while; a little apart from the others
-            let poll = POLL + Duration::from_millis(random::bits() % 1000);
+            // Whoever is not woken looks again after a while, soon where others only were faster; a little apart from them
+            let poll = match crowded {
+                0 => POLL + Duration::from_millis(random::bits() % 1000),
+                tries => CROWDED * (1 << tries.min(6)) + Duration::from_millis(random::bits() % 20),
+            };
             tokio::select! { () = woken => {}, () = tokio::time::sleep(left.min(poll)) => {} }
         }
     }
 
-    async fn try_claim(&self, request: &ClaimRequest, session: &Session) -> Result<Option<Claim>> {
+    /// What there is for a worker; if nothing, whether only others were at it.
+    async fn try_claim(&self, request: &ClaimRequest, session: &Session) -> Result<(Option<Claim>, bool)> {
         let start = Instant::now();
         let warm: Vec<(i64, i64)> = request.warm.iter().take(8).map(|w| (w.pass, w.segment)).collect();
         let (candidates, alive) = self
@@ -150,6 +160,7 @@ impl Coordinator {
                 Some((choose(farm, &asker, now, random::bits()), farm.alive(now)))
             })
             .unwrap_or_default();
+        let mut is_busy = false;
         for candidate in candidates {
             let claimer = Claimer {
                 worker: &session.worker,
@@ -159,9 +170,18 @@ impl Coordinator {
             };
             let from_tail = candidate.locality == Locality::Steal;
             let (ttl, now) = (self.settings.lease_ttl_ms, self.now());
-            let Some(granted) = self.store.claim(&candidate, from_tail, &claimer, ttl, now).await? else {
-                self.write_farm(|farm| farm.was_empty(candidate.pass, candidate.segment, now + EMPTY_MS));
-                continue;
+            let granted = match self.store.claim(&candidate, from_tail, &claimer, ttl, now).await? {
+                Taken::Granted(granted) => granted,
+                Taken::Busy => {
+                    is_busy = true;
+                    continue;
+                }
+                Taken::Empty => {
+                    self.write_farm(|farm| {
+                        farm.was_empty(candidate.pass, candidate.segment, now + EMPTY_MS);
+                    });
+                    continue;
+                }
             };
             let Candidate { pass, segment, locality, .. } = candidate;
             let count = granted.batches.len() as i64;
@@ -171,16 +191,11 @@ impl Coordinator {
             metrics::histogram!("pantaray_claim_seconds").record(start.elapsed().as_secs_f64());
             let task = self.task(pass).await?;
             let task = (*task).clone();
-            return Ok(Some(Claim {
-                lease: granted.lease,
-                ttl_ms: ttl,
-                pass,
-                task,
-                segment,
-                batches: granted.batches,
-            }));
+            let claim =
+                Claim { lease: granted.lease, ttl_ms: ttl, pass, task, segment, batches: granted.batches };
+            return Ok((Some(claim), false));
         }
-        Ok(None)
+        Ok((None, is_busy))
     }
 
     /// What a pass does; that never changes.

@@ -5,6 +5,7 @@ use protocol::work::ClaimedBatch;
 
 use super::Store;
 use crate::scheduler::choose::Candidate;
+use crate::scheduler::failure::BLOCK_AFTER;
 use crate::{Result, values};
 
 /// Who claims.
@@ -20,6 +21,27 @@ pub struct Claimer<'a> {
     pub alive: i64,
 }
 
+/// What came of a claim.
+#[derive(Clone, Debug)]
+pub enum Taken {
+    /// Batches.
+    Granted(Granted),
+    /// Another claim has the segment at this moment: there may be something in it.
+    Busy,
+    /// Nothing.
+    Empty,
+}
+
+impl Taken {
+    /// What was got, if anything.
+    pub fn granted(self) -> Option<Granted> {
+        match self {
+            Self::Granted(granted) => Some(granted),
+            Self::Busy | Self::Empty => None,
+        }
+    }
+}
+
 /// What a claim got.
 #[derive(Clone, Debug)]
 pub struct Granted {
@@ -32,7 +54,8 @@ pub struct Granted {
 }
 
 impl Store {
-    /// Claims up to `candidate.count` batches of a segment; none where it is closed, empty, or being claimed from.
+    /// Claims up to `candidate.count` batches of a segment; none where it is closed, empty, or being claimed from, or where the
+    /// job does not want the worker.
     ///
     /// # Errors
     /// When the database refuses.
@@ -43,22 +66,24 @@ impl Store {
         claimer: &Claimer<'_>,
         ttl_ms: i64,
         now: i64,
-    ) -> Result<Option<Granted>> {
+    ) -> Result<Taken> {
         let Candidate { pass, segment, count, .. } = *candidate;
         let mut tx = self.begin().await?;
 
         // Lock the segment, or leave it to whoever has it; a process whose name another has taken gets nothing
-        let sql = format!(
-            "SELECT p.job_id, j.started_at FROM segment s JOIN pass p ON p.id = s.pass_id JOIN job j ON j.id = p.job_id
+        let sql = "SELECT p.job_id, j.started_at FROM segment s JOIN pass p ON p.id = s.pass_id JOIN job j ON j.id = p.job_id
             WHERE s.pass_id = $1 AND s.seg = $2 AND s.n_ready > 0 AND p.state = $3 AND j.paused = 0
-                AND NOT EXISTS (SELECT 1 FROM worker w WHERE w.name = $4 AND w.session <> $5){}",
-            self.dialect().lock_s_skip
-        );
-        let values = values![pass, segment, PassState::Open.code(), claimer.worker, claimer.session];
-        let rows = tx.query(sql.into(), values).await?;
+                AND NOT EXISTS (SELECT 1 FROM worker w WHERE w.name = $4 AND w.session <> $5)
+                AND NOT EXISTS (SELECT 1 FROM worker_block k WHERE k.worker = $4 AND k.job_id = j.id AND k.n >= $6)";
+        let (open, block) = (PassState::Open.code(), BLOCK_AFTER);
+        let values = values![pass, segment, open, claimer.worker, claimer.session, block];
+        let skip = self.dialect().lock_s_skip;
+        let rows = tx.query(format!("{sql}{skip}").into(), values.clone()).await?;
         let Some(row) = rows.first() else {
             tx.rollback().await?;
-            return Ok(None);
+            // Where rows are skipped, one that can be seen is one that somebody has
+            let is_busy = !skip.is_empty() && self.query_one(sql, values).await?.is_some();
+            return Ok(if is_busy { Taken::Busy } else { Taken::Empty });
         };
         let (job, first_of_job) = (row.text(0)?, row.int_or_null(1)?.is_none());
 
@@ -88,7 +113,7 @@ impl Store {
         if batches.is_empty() {
             // Others skip a locked segment: it must be free before this claim says that it found nothing
             tx.rollback().await?;
-            return Ok(None);
+            return Ok(Taken::Empty);
         }
         batches.sort_unstable_by_key(|batch| batch.batch);
 
@@ -110,6 +135,6 @@ impl Store {
         if first_of_job {
             self.job_started(&job, now).await?;
         }
-        Ok(Some(Granted { lease, batches, first_of_job }))
+        Ok(Taken::Granted(Granted { lease, batches, first_of_job }))
     }
 }

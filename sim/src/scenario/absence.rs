@@ -58,7 +58,14 @@ pub fn reconnect(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
     let batches = size.batches(1);
     let job = stage.submit(Load { group: 1, ..Load::new(batches, 10_000.0, 60_000) }, |_| {})?;
     stage.prepare(&[&job])?;
+    stage.client().act(&job.id, "pause")?;
     stage.hire(&size.crew())?;
+    stage.until("all workers are known", PATIENCE, || {
+        Ok(stage.shared.registered.load(Ordering::Relaxed) == size.workers)
+    })?;
+    // The coordinator looks at the farm once a second: each worker is to get its one batch
+    std::thread::sleep(Duration::from_secs(2));
+    stage.client().act(&job.id, "resume")?;
     stage.until("all workers are busy", PATIENCE, || {
         Ok(stage.shared.busy.load(Ordering::Relaxed) >= size.workers)
     })?;

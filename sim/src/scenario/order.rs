@@ -15,7 +15,8 @@ const TOLD_MS: i64 = 15_000;
 
 /// Ten jobs of ten priorities, and an eleventh of the highest when all workers are taken.
 pub fn priority(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
-    let load = || Load::new(size.batches(400), 25.0, TOLD_MS);
+    // Segments are short, so that workers often choose
+    let load = || Load::new(size.batches(80), 25.0, TOLD_MS);
     let mut jobs: Vec<(i64, Job)> = Vec::new();
     for priority in (5..100).step_by(10) {
         jobs.push((priority, stage.submit(load(), |request| request.priority = priority)?));

@@ -152,7 +152,7 @@ impl Queue {
     ) -> Option<Granted> {
         let claimer = Claimer { worker, session: worker, memory_bytes: 4 << 30, alive };
         let candidate = Candidate { pass, segment, locality: Locality::Cold, count };
-        self.store.claim(&candidate, false, &claimer, TTL, self.now).await.expect("claimed")
+        self.store.claim(&candidate, false, &claimer, TTL, self.now).await.expect("claimed").granted()
     }
 
     pub(crate) async fn complete(

@@ -30,8 +30,15 @@ struct Sample {
     varying: (u32, u32, f32),
 }
 
-/// Points of the curves that are read at once, about: some 300 MB with all that is made of them.
-pub(super) const PART_POINTS: usize = if cfg!(test) { 1 << 12 } else { 1 << 19 };
+/// Points of the curves that are read at once, about: some 100 MB with all that is made of them.
+pub(super) const PART_POINTS: usize = if cfg!(test) { 1 << 12 } else { 1 << 17 };
+
+/// Samples for each point, about: curves that bend much have more.
+pub(super) const SAMPLES_PER_POINT: usize = 3;
+
+/// Bytes of a sample, and of what stays in memory for each point of the prim: its place, width and number.
+pub(super) const SAMPLE_BYTES: u64 = 144;
+pub(super) const POINT_BYTES: u64 = 40;
 
 /// Reads the curves of one of the prim's parts: those whose first point is one of its [`PART_POINTS`].
 pub(super) fn read(stage: &Stage, prim: &Prim, part: usize, attributes: &[Attribute]) -> Result<Geometry> {

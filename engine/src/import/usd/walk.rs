@@ -6,7 +6,7 @@ use std::rc::Rc;
 use glam::{DMat4, DVec3, DVec4};
 use openusd::sdf::Specifier;
 
-use super::curves::PART_POINTS;
+use super::curves::{PART_POINTS, POINT_BYTES, SAMPLE_BYTES, SAMPLES_PER_POINT};
 use super::primvar::{self, Primvar};
 use super::read::Stage;
 use super::{dress, instancer, material, polygons, xform};
@@ -105,14 +105,18 @@ pub(super) fn catalogue(stage: &Stage) -> Result<Catalogue> {
                 .and_then(|value| super::value::integers(&value))
                 .map_or(0, |all| all.len())
         };
-        let points = if prim.parts > 1 { PART_POINTS } else { prim.points };
-        let (corners, faces) = match prim.kind {
-            Kind::Mesh => (length("faceVertexIndices"), length("faceVertexCounts")),
-            Kind::Points => (prim.points, prim.points),
-            // About as many lines as points, some curves being cut finer
-            Kind::Curves => (4 * points, 2 * points),
+        let (points, corners, faces) = match prim.kind {
+            Kind::Mesh => (prim.points, length("faceVertexIndices"), length("faceVertexCounts")),
+            Kind::Points => (prim.points, prim.points, prim.points),
+            Kind::Curves => {
+                let samples = SAMPLES_PER_POINT * prim.points.min(PART_POINTS);
+                (samples, 2 * samples, samples)
+            }
         };
-        let bytes = polygons::need_memory(stage, &prim.path, points, corners, faces, &attributes)?;
+        let mut bytes = polygons::need_memory(stage, &prim.path, points, corners, faces, &attributes)?;
+        if prim.kind == Kind::Curves {
+            bytes += points as u64 * SAMPLE_BYTES + prim.points as u64 * POINT_BYTES;
+        }
         found.memory_bytes = found.memory_bytes.max(bytes);
     }
     found.memory_bytes += stage.layer_bytes();
