@@ -3,7 +3,6 @@
 //! equal what they count, and no acknowledged submission is lost: `sim`'s stage compares all books at its end.
 
 mod kills;
-mod scenarios;
 mod troubles;
 
 use std::path::PathBuf;
