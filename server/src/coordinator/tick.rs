@@ -30,13 +30,16 @@ struct Times {
     seen: Instant,
     swept: Instant,
     probed: Instant,
+    /// Whether the last round has made batches, after which there may be more to make.
+    is_creating: bool,
 }
 
 impl Coordinator {
     /// Runs until the coordinator stops.
     pub async fn run(self: Arc<Self>) {
         let now = Instant::now();
-        let mut times = Times { refreshed: now, expired: now, seen: now, swept: now, probed: now };
+        let mut times =
+            Times { refreshed: now, expired: now, seen: now, swept: now, probed: now, is_creating: false };
         self.dirty.store(true, Ordering::SeqCst);
         while !self.is_stopping() {
             let more = match self.round(&mut times).await {
@@ -78,8 +81,8 @@ impl Coordinator {
             self.pend(self.store.live_jobs().await?);
         }
         more |= self.advance_pending().await?;
-        if dirty || more {
-            more |= self.create_and_sweep().await?;
+        if dirty || more || times.is_creating {
+            times.is_creating = self.create_and_sweep().await?;
         }
         if dirty || more || (busy && times.refreshed.elapsed() >= REFRESH) {
             times.refreshed = Instant::now();
@@ -90,7 +93,7 @@ impl Coordinator {
             let seen: Vec<String> = lock(&self.seen).drain().collect();
             self.renew_sessions(self.store.seen(&seen, self.now()).await?);
         }
-        Ok(more)
+        Ok(more || times.is_creating)
     }
 
     async fn expire(&self) -> Result<bool> {
