@@ -37,7 +37,7 @@ pub struct Arguments {
     #[arg(long, value_name = "SIZE", default_value = "1GiB", value_parser = values::size)]
     memory: u64,
     /// The time code at which USD is read [default: its default values]
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = values::finite, allow_negative_numbers = true)]
     frame: Option<f64>,
     /// Dice faces, and subdivision surfaces on their limit, to edges of SIZE units, or of PIXELS (1) pixels of a camera;
     /// leaves along their texture to edges of N (2) texels

@@ -60,6 +60,12 @@ pub fn vector(text: &str) -> Result<glam::DVec3, String> {
     }
 }
 
+/// A number that is one.
+pub fn finite(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok().filter(|number| number.is_finite());
+    number.ok_or_else(|| "expected a number".into())
+}
+
 /// Pixels across and down: `1280x720`.
 pub fn resolution(text: &str) -> Result<[u32; 2], String> {
     let side = |side: &str| side.parse::<u32>().ok().filter(|pixels| (1..=65_536).contains(pixels));

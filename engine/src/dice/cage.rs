@@ -27,6 +27,8 @@ pub struct Cage {
     pub linear: Vec<f32>,
     /// Linear values of a corner.
     pub linear_width: usize,
+    /// Values per corner that follow the surface: cages of the same faces, whose points are several at a seam.
+    pub skins: Vec<Cage>,
     /// Sharp edges by their ends, the lower first, from 0 to [`SHARP`].
     pub creases: HashMap<[u32; 2], f32>,
     /// Sharp points.
@@ -49,6 +51,10 @@ pub struct Prepared<'a> {
     halved: HashSet<[u32; 2]>,
     /// Points at creases that are sharp for a while: the level behind which they are not.
     depths: HashMap<u32, u8>,
+    /// Points whose faces are neither one fan nor meet along one line: they stay where they are.
+    knots: HashSet<u32>,
+    /// The cage's skins.
+    pub(super) skins: Vec<Prepared<'a>>,
 }
 
 impl Cage {
@@ -98,7 +104,12 @@ impl Cage {
             ends.iter().for_each(|&end| deepen(end, sharpness));
         }
         self.sharp_points.iter().for_each(|(&point, &sharpness)| deepen(point, sharpness));
-        Prepared { cage: self, rate, face_ends, faces: by_point, halved, depths }
+        let skins = self.skins.iter().map(|skin| skin.prepare(rate)).collect();
+        let knots = HashSet::new();
+        let mut prepared =
+            Prepared { cage: self, rate, face_ends, faces: by_point, halved, depths, knots, skins };
+        prepared.knots = (0..self.positions.len() as u32).filter(|&point| prepared.is_knot(point)).collect();
+        prepared
     }
 }
 
@@ -109,9 +120,64 @@ impl Prepared<'_> {
         &self.faces[start as usize..self.face_ends[point as usize] as usize]
     }
 
+    /// The given faces and all around them, in order.
+    pub(super) fn with_neighbours(&self, faces: &[u32]) -> Vec<u32> {
+        let inner = faces.iter().flat_map(|&face| &self.cage.corners[self.cage.face(face)]);
+        let mut numbers: Vec<u32> = inner.flat_map(|&point| self.faces_of(point)).copied().collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        numbers
+    }
+
+    /// Whether the rules of smooth points, creases and borders say nothing of a point: its faces touch there without an
+    /// edge between them, or an edge of more than two faces, or of two that face opposite ways, ends there or branches.
+    fn is_knot(&self, point: u32) -> bool {
+        // The neighbours behind and before the point in each face, by the first
+        let faces = self.faces_of(point).iter();
+        let mut links: Vec<[u32; 2]> = faces.map(|&face| self.neighbours(face, point)).collect();
+        links.sort_unstable();
+        let mut befores: Vec<u32> = links.iter().map(|link| link[1]).collect();
+        befores.sort_unstable();
+        let behinds: Vec<u32> = links.iter().map(|link| link[0]).collect();
+        let twice = |all: &[u32]| -> Vec<u32> {
+            all.windows(2).filter(|pair| pair[0] == pair[1]).map(|pair| pair[0]).collect()
+        };
+        let mut odd = [twice(&behinds), twice(&befores)].concat();
+        odd.sort_unstable();
+        odd.dedup();
+        if !odd.is_empty() {
+            let has = |all: &[u32], end: &u32| all.binary_search(end).is_ok();
+            let is_border = |other: &[u32], end: &u32| !has(other, end) && !has(&odd, end);
+            let on_border = behinds.iter().any(|end| is_border(&befores, end))
+                || befores.iter().any(|end| is_border(&behinds, end));
+            // Along a line where sheets meet, points lie on a crease
+            return odd.len() != 2 || on_border;
+        }
+        if links.is_empty() {
+            return false;
+        }
+        // Walk from face to face, from the border if there is one: a single fan has them all
+        let first = links.iter().position(|link| befores.binary_search(&link[0]).is_err()).unwrap_or(0);
+        let (mut at, mut steps) = (Some(first), 0);
+        while let Some(here) = at.filter(|&here| here != first || steps == 0) {
+            steps += 1;
+            at = behinds.binary_search(&links[here][1]).ok();
+        }
+        steps < links.len()
+    }
+
+    /// The points behind and before one in a face.
+    fn neighbours(&self, face: u32, point: u32) -> [u32; 2] {
+        let corners = &self.cage.corners[self.cage.face(face)];
+        let count = corners.len();
+        let at = corners.iter().position(|&corner| corner == point).expect("a face of this point");
+        [corners[(at + 1) % count], corners[(at + count - 1) % count]]
+    }
+
     /// How sharp a point is.
     pub(super) fn point_sharpness(&self, point: u32) -> f32 {
-        let corner = if self.cage.sharp_corners && self.faces_of(point).len() == 1 { SHARP } else { 0.0 };
+        let is_corner = self.cage.sharp_corners && self.faces_of(point).len() == 1;
+        let corner = if is_corner || self.knots.contains(&point) { SHARP } else { 0.0 };
         self.cage.sharp_points.get(&point).map_or(corner, |own| own.max(corner))
     }
 
@@ -141,6 +207,13 @@ impl Prepared<'_> {
             4 => 1 << (2 * finest),
             _ => (count as u64) << (2 * finest.saturating_sub(1)),
         }
+    }
+
+    /// Whether a face stays coarser than asked for.
+    pub fn falls_short(&self, face: u32) -> bool {
+        let edges = (0..self.cage.face(face).len()).map(|side| self.cage.edge(face, side));
+        let mut ends = edges.map(|ends| ends.map(|end| self.cage.positions[end as usize]));
+        ends.any(|[a, b]| self.rate.falls_short(a, b))
     }
 
     /// The centre of a face.

@@ -61,12 +61,16 @@ impl Level {
         }
         sides.sort_unstable();
         self.corner_edges = vec![0; self.corners.len()];
+        // How many more faces have an edge in the direction of its lower end than in the other
+        let mut balances = Vec::new();
         for (ends, corner) in sides {
             if self.edges.last() != Some(&ends) {
                 self.edges.push(ends);
                 self.edge_faces.push(([NONE; 2], 0));
+                balances.push(0);
             }
             let edge = self.edges.len() - 1;
+            balances[edge] += if self.corners[corner as usize] == ends[0] { 1 } else { -1 };
             self.corner_edges[corner as usize] = edge as u32;
             let (faces, count) = &mut self.edge_faces[edge];
             if let Some(slot) = faces.get_mut(*count as usize) {
@@ -74,9 +78,9 @@ impl Level {
             }
             *count += 1;
         }
-        let sharp = |(edge, ends): (usize, &[u32; 2])| match self.edge_faces[edge].1 {
-            2 => creases.get(ends).copied().unwrap_or(0.0),
-            // A border, or a place where more than two faces meet
+        let sharp = |(edge, ends): (usize, &[u32; 2])| match (self.edge_faces[edge].1, balances[edge]) {
+            (2, 0) => creases.get(ends).copied().unwrap_or(0.0),
+            // A border, a place where more than two faces meet, or two that face opposite ways
             _ => SHARP,
         };
         self.edge_sharpness = self.edges.iter().enumerate().map(sharp).collect();

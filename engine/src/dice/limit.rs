@@ -97,12 +97,16 @@ impl Fan {
     fn around(level: &Level, corner: u32) -> Self {
         let corners = level.corners_of(level.corners[corner as usize]).len();
         // Back to the sharp edge that the fan begins with, or once around
-        let mut first = corner;
+        let (mut first, mut lowest) = (corner, corner);
         let mut closed = true;
+        let edge = |corner: u32| level.corner_edges[corner as usize];
         for _ in 0..corners {
-            match level.across(first, level.corner_edges[first as usize]) {
+            match level.across(first, edge(first)) {
                 // The face across the edge to the next corner lies clockwise
-                Some(before) if before != corner => first = before,
+                Some(before) if before != corner => {
+                    first = before;
+                    lowest = if edge(before) < edge(lowest) { before } else { lowest };
+                }
                 Some(_) => break,
                 None => {
                     closed = false;
@@ -112,9 +116,7 @@ impl Fan {
         }
         if closed {
             // Begin with the edge of the lowest number, whichever face asks
-            let all = level.corners_of(level.corners[corner as usize]);
-            first =
-                *all.iter().min_by_key(|&&c| level.corner_edges[c as usize]).expect("a corner has a face");
+            first = lowest;
         }
         let mut fan = Self { edges: Vec::new(), faces: Vec::new(), closed };
         let mut at = first;
@@ -122,7 +124,7 @@ impl Fan {
             fan.edges.push(level.corners[level.turn(at, 1) as usize]);
             fan.faces.push(level.corners[level.turn(at, 2) as usize]);
             let last = level.turn(at, -1);
-            match level.across(at, level.corner_edges[last as usize]) {
+            match level.across(at, edge(last)) {
                 Some(next) if next != first => at = next,
                 Some(_) => break,
                 None => {

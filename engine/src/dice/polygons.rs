@@ -42,10 +42,20 @@ impl Polygons {
         self.corners[range].iter().map(|&corner| self.positions[corner as usize]).sum::<DVec3>() / count
     }
 
+    /// Whether a face stays coarser than asked for.
+    pub fn falls_short(&self, face: u32, rate: &Rate) -> bool {
+        (0..self.face(face).len()).map(|side| self.side(face, side)).any(|[a, b]| rate.falls_short(a, b))
+    }
+
+    /// The ends of a side.
+    fn side(&self, face: u32, side: usize) -> [DVec3; 2] {
+        let corners = &self.corners[self.face(face)];
+        [corners[side], corners[(side + 1) % corners.len()]].map(|point| self.positions[point as usize])
+    }
+
     /// The level of a side.
     fn level(&self, face: u32, side: usize, rate: &Rate) -> u8 {
-        let corners = &self.corners[self.face(face)];
-        let [a, b] = [corners[side], corners[(side + 1) % corners.len()]].map(|i| self.positions[i as usize]);
+        let [a, b] = self.side(face, side);
         rate.level(a, b)
     }
 

@@ -86,12 +86,17 @@ impl Rate {
         }
     }
 
-    /// How often an edge is halved: so that its parts are no longer than wanted at its ends and its middle.
-    pub fn level(&self, a: DVec3, b: DVec3) -> u8 {
-        let wanted = match self {
+    /// The length that the parts of an edge must not exceed: the least of those wanted at its ends and its middle.
+    fn wanted(&self, a: DVec3, b: DVec3) -> f64 {
+        match self {
             Self::World(size) => *size,
             Self::Camera(_) => self.edge_at(a).min(self.edge_at(b)).min(self.edge_at(0.5 * (a + b))),
-        };
+        }
+    }
+
+    /// How often an edge is halved: so that its parts are no longer than wanted, but not more than [`LEVEL_MAX`] times.
+    pub fn level(&self, a: DVec3, b: DVec3) -> u8 {
+        let wanted = self.wanted(a, b);
         // By doubling: a logarithm may differ between machines
         let (mut length, mut level) = (a.distance(b), 0);
         while length > wanted && level < LEVEL_MAX {
@@ -99,6 +104,11 @@ impl Rate {
             level += 1;
         }
         level
+    }
+
+    /// Whether the parts of an edge are longer than wanted all the same.
+    pub fn falls_short(&self, a: DVec3, b: DVec3) -> bool {
+        a.distance(b) > self.wanted(a, b) * f64::from(1_u32 << LEVEL_MAX)
     }
 }
 
@@ -150,6 +160,7 @@ mod tests {
         let level = |length: f64| rate.level(DVec3::ZERO, DVec3::X * length);
         assert_eq!([0.5, 1.0, 1.1, 2.0, 2.1, 4.1].map(level), [0, 0, 1, 1, 2, 3]);
         assert_eq!(level(1e30), LEVEL_MAX);
+        assert_eq!([256.0, 257.0].map(|x| rate.falls_short(DVec3::ZERO, DVec3::X * x)), [false, true]);
         let (a, b) = (DVec3::new(3.0, 1.0, -4.0), DVec3::new(-30.0, 0.0, 9.0));
         assert_eq!(camera().level(a, b), camera().level(b, a));
         assert!(Rate::world(0.0).is_err() && Rate::world(f64::NAN).is_err());

@@ -55,17 +55,27 @@ impl Patch {
     }
 }
 
+/// A level of the surface, and that of each of its skins: the same faces over points of their own.
+struct Levels {
+    places: Level,
+    skins: Vec<Level>,
+}
+
 impl Prepared<'_> {
     /// Dices some of the faces.
     pub fn dice(&self, faces: &[u32]) -> Diced {
         let mut faces = faces.to_vec();
         faces.sort_unstable();
-        let (mut level, numbers) = self.part(&faces);
+        let numbers = self.with_neighbours(&faces);
+        let mut levels = Levels {
+            places: self.part(&numbers),
+            skins: self.skins.iter().map(|skin| skin.part(&numbers)).collect(),
+        };
         let mut patches: Vec<Patch> = faces.iter().flat_map(|&face| self.patches(face)).collect();
 
         // Which patch and cell a face of the level is
-        let mut cells: Vec<Option<(u32, u32, u32)>> = vec![None; level.ends.len()];
-        let mut first_patches = vec![0; level.ends.len()];
+        let mut cells: Vec<Option<(u32, u32, u32)>> = vec![None; numbers.len()];
+        let mut first_patches = vec![0; numbers.len()];
         for (number, patch) in patches.iter_mut().enumerate().rev() {
             let face = numbers.binary_search(&patch.face).expect("a part has its own faces");
             first_patches[face] = number as u32;
@@ -74,9 +84,12 @@ impl Prepared<'_> {
         }
         let last = patches.iter().map(Patch::last).max().unwrap_or(0);
         for depth in 1..=last {
-            let kept = kept(&level, &cells, |patch| patches[patch as usize].last() >= depth);
+            let level = &levels.places;
+            let kept = kept(level, &cells, |patch| patches[patch as usize].last() >= depth);
             let is_quad = |face: u32| level.face(face).len() == 4;
-            let step = refine(&level, &kept, &|face, child| if is_quad(face) { (4 - child) % 4 } else { 0 });
+            let turned = |face, child| if is_quad(face) { (4 - child) % 4 } else { 0 };
+            let step = refine(level, &kept, &turned);
+            let skins = levels.skins.iter().map(|skin| refine(skin, &kept, &turned).level).collect();
             let place = |&(parent, child): &(u32, u32)| -> Option<(u32, u32, u32)> {
                 let (patch, i, j) = cells[parent as usize]?;
                 let is_done = |patch: u32| patches[patch as usize].last() < depth;
@@ -99,24 +112,20 @@ impl Prepared<'_> {
                     patch.cells[(j * n + i) as usize] = face as u32;
                 }
             }
-            (level, cells) = (step.level, next);
+            (levels, cells) = (Levels { places: step.level, skins }, next);
             patches
                 .iter_mut()
                 .filter(|patch| patch.last() >= depth)
-                .for_each(|p| self.read(&level, depth, p));
+                .for_each(|patch| self.read(&levels, depth, patch));
         }
         let mut diced = Diced::default();
         patches.iter().for_each(|patch| self.emit(patch, &mut diced));
         diced
     }
 
-    /// The given faces and all around them as a level of its own, with the faces' numbers.
-    fn part(&self, faces: &[u32]) -> (Level, Vec<u32>) {
+    /// Faces, in order, as a level of its own.
+    fn part(&self, numbers: &[u32]) -> Level {
         let cage = self.cage;
-        let inner = faces.iter().flat_map(|&face| &cage.corners[cage.face(face)]);
-        let mut numbers: Vec<u32> = inner.flat_map(|&point| self.faces_of(point)).copied().collect();
-        numbers.sort_unstable();
-        numbers.dedup();
         let corners = || numbers.iter().flat_map(|&face| &cage.corners[cage.face(face)]).copied();
         let mut points: Vec<u32> = corners().collect();
         points.sort_unstable();
@@ -131,7 +140,7 @@ impl Prepared<'_> {
             level.vertex_sharpness.push(self.point_sharpness(point));
         }
         let mut end = 0;
-        for &face in &numbers {
+        for &face in numbers {
             end += cage.face(face).len() as u32;
             level.ends.push(end);
         }
@@ -145,7 +154,7 @@ impl Prepared<'_> {
             }
         }
         level.connect(&creases);
-        (level, numbers)
+        level
     }
 
     /// The patches of a face.
@@ -197,11 +206,11 @@ impl Prepared<'_> {
     }
 
     /// Reads off what a patch has at this level.
-    fn read(&self, level: &Level, depth: u8, patch: &mut Patch) {
+    fn read(&self, levels: &Levels, depth: u8, patch: &mut Patch) {
         let n = 1_usize << (depth - patch.first());
         for corner in (0..4).filter(|&corner| patch.corner_depths[corner] == depth) {
             let (i, j) = [(0, 0), (n, 0), (n, n), (0, n)][corner];
-            patch.corners[corner] = Some(self.vertex(level, patch, n, i, j));
+            patch.corners[corner] = Some(self.vertex(levels, patch, n, i, j));
         }
         for side in (0..4).filter(|&side| patch.side_depths[side] == depth) {
             let steps = 1_usize << patch.levels[side];
@@ -212,18 +221,19 @@ impl Prepared<'_> {
                 2 => (n - step * stride, n),
                 _ => (0, n - step * stride),
             };
-            let points = (1..steps).map(at).map(|(i, j)| self.vertex(level, patch, n, i, j));
+            let points = (1..steps).map(at).map(|(i, j)| self.vertex(levels, patch, n, i, j));
             patch.sides[side] = points.collect();
         }
         if patch.inside_depth == depth {
             let [us, vs] = [patch.u(), patch.v()].map(|level| 1_usize << level);
             let places = (1..vs).flat_map(|j| (1..us).map(move |i| (i * n / us, j * n / vs)));
-            patch.inside = places.map(|(i, j)| self.vertex(level, patch, n, i, j)).collect();
+            patch.inside = places.map(|(i, j)| self.vertex(levels, patch, n, i, j)).collect();
         }
     }
 
     /// The vertex of the limit surface at a place of a patch's `n` by `n` cells.
-    fn vertex(&self, level: &Level, patch: &Patch, n: usize, i: usize, j: usize) -> Vertex {
+    fn vertex(&self, levels: &Levels, patch: &Patch, n: usize, i: usize, j: usize) -> Vertex {
+        let level = &levels.places;
         let (column, line) = (i.min(n - 1), j.min(n - 1));
         let which = match (i - column, j - line) {
             (0, 0) => 0,
@@ -234,6 +244,10 @@ impl Prepared<'_> {
         let corner = level.face(patch.cells[line * n + column]).start + which;
         let row = limit::row(level, level.corners[corner]);
         let mut values: Vec<f32> = row[3..].iter().map(|&value| value as f32).collect();
+        for skin in &levels.skins {
+            let row = limit::row(skin, skin.corners[corner]);
+            values.extend(row[3..].iter().map(|&value| value as f32));
+        }
         values.extend(self.linear(patch, i as f32 / n as f32, j as f32 / n as f32));
         let position = DVec3::from_slice(&row);
         Vertex { position, normal: limit::normal(level, corner as u32), values, point: NO_POINT }

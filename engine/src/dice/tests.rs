@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use glam::{DVec3, Vec3};
+use proptest::prelude::*;
 
 use super::cage::Cage;
 use super::*;
@@ -195,5 +196,80 @@ fn values_follow_the_surface_or_the_face() {
                 .iter()
                 .all(|&v| (diced.values[4 * v as usize + 3] - source as f32).abs() < 1e-5)
         );
+    }
+}
+
+/// Catches weights that do not sum to one where the rules of smooth surfaces say nothing: points that cubes share, alone or
+/// at the end of an edge, stay; along the edge of three sheets the surface follows its curve.
+#[test]
+fn where_sheets_meet_the_surface_holds() {
+    let far = DVec3::new(1e6, -3e6, 2e6);
+    let shifted =
+        |by: DVec3| cube().positions.iter().map(move |p| (*p + by + far).to_array()).collect::<Vec<_>>();
+    let faces = |other: [u32; 8]| {
+        let cube = cube();
+        let own = cube.corners.chunks(4).map(|face| face.to_vec());
+        let others = cube.corners.chunks(4).map(|face| face.iter().map(|&c| other[c as usize]).collect());
+        own.chain(others).collect::<Vec<Vec<u32>>>()
+    };
+    for (by, other, shared) in [
+        (DVec3::splat(2.0), [7, 9, 10, 11, 12, 13, 14, 15], vec![7]),
+        (DVec3::new(2.0, 2.0, 0.0), [3, 9, 10, 11, 7, 13, 14, 15], vec![3, 7]),
+    ] {
+        let positions = [shifted(DVec3::ZERO), shifted(by)].concat();
+        let faces = faces(other);
+        let cage = cage(&positions, &faces.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let diced = dice(&cage, 0.3);
+        assert_closed(&[dice(&cage, 0.3)]);
+        for (&position, &point) in diced.positions.iter().zip(&diced.points) {
+            assert!((position - far - 0.5 * by).abs().max_element() < 2.0, "{position}");
+            if shared.contains(&point) {
+                assert_eq!(position, cage.positions[point as usize]);
+            }
+        }
+    }
+    // Three sheets of two quads each, on a line along y that bends
+    let mut positions = vec![[0.0, 0.0, 0.0], [0.0, 1.0, 0.5], [0.0, 2.0, 0.0]];
+    let mut sheets = Vec::new();
+    for (x, z) in [(1.0, 0.0), (-1.0, 0.5), (0.0, 1.0)] {
+        let first = positions.len() as u32;
+        positions.extend([0.0, 1.0, 2.0].map(|y| [x, y, z]));
+        sheets.extend([[0, first, first + 1, 1], [1, first + 1, first + 2, 2]]);
+    }
+    let cage = cage(&positions, &sheets.iter().map(|sheet| &sheet[..]).collect::<Vec<_>>());
+    let diced = dice(&cage, 0.2);
+    let middle = diced.points.iter().position(|&point| point == 1).unwrap();
+    let expected = (4.0 * cage.positions[1] + cage.positions[0] + cage.positions[2]) / 6.0;
+    assert!((diced.positions[middle] - expected).length() < 1e-12, "{}", diced.positions[middle]);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+
+    /// Catches a cage, however its faces meet, that panics, leaves its own box, or has other vertices in parts.
+    #[test]
+    fn any_cage_is_diced_inside_its_box(
+        faces in prop::collection::vec(prop::sample::subsequence((0..8_u32).collect::<Vec<_>>(), 3..6).prop_shuffle(), 1..9),
+        creases in prop::collection::vec((0..8_u32, 0..8_u32, 0.0..SHARP), 0..6),
+        points in prop::collection::vec((0..8_u32, 0.0..SHARP), 0..2),
+    ) {
+        let mut cage = cage(&[], &faces.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let far = DVec3::new(4e6, -1e6, 2e6);
+        cage.positions = cube().positions.iter().enumerate().map(|(i, p)| *p * (1.0 + 0.1 * i as f64) + far).collect();
+        cage.creases = creases.iter().map(|&(a, b, sharpness)| ([a.min(b), a.max(b)], sharpness)).collect();
+        cage.sharp_points = points.iter().copied().collect();
+        let whole = dice(&cage, 0.7);
+        for (position, normal) in whole.positions.iter().zip(&whole.normals) {
+            prop_assert!((*position - far).abs().max_element() < 1.7 + 1e-8, "{}", *position - far);
+            prop_assert!(*normal == Vec3::ZERO || (normal.length() - 1.0).abs() < 1e-5);
+        }
+        let rate = Rate::world(0.7).unwrap();
+        let prepared = cage.prepare(&rate);
+        let parts: Vec<Diced> = (0..faces.len() as u32).map(|face| prepared.dice(&[face])).collect();
+        let places = |parts: &[Diced]| {
+            let all = parts.iter().flat_map(|diced| &diced.positions);
+            all.map(|p| p.to_array().map(f64::to_bits)).collect::<std::collections::BTreeSet<_>>()
+        };
+        prop_assert!(places(&[whole]) == places(&parts));
     }
 }

@@ -334,7 +334,7 @@ mod tests {
     use crate::import::ImportReport;
     use crate::math::Bounds;
 
-    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
     /// A wavy sheet of `n` by `n` quads in file order by rows.
     fn sheet(n: u32) -> Mesh {

@@ -3,15 +3,16 @@
 //! Faces are diced in chunks that lie close together, several at once, and written in order. All vertices are rounded to one
 //! step for the whole mesh, so that chunks agree where they meet.
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use rayon::prelude::*;
 
+use super::columns::Columns;
 use super::emit::{self, Emitter, Placement};
-use super::mesh::{Extra, ExtraRate, Face, Mesh, is_usable};
+use super::mesh::{Mesh, is_usable};
 use super::{ImportReport, cut};
 use crate::dice::cage::{Cage, Prepared};
 use crate::dice::polygons::Polygons;
-use crate::dice::{Diced, NO_POINT, Rate};
+use crate::dice::{Rate, Seams};
 use crate::{Error, ErrorKind, Result};
 
 /// Faces that a chunk becomes at most, unless one of its faces alone becomes more: some 30 MB.
@@ -54,6 +55,12 @@ pub(super) fn emit(
         None => Surface::Polygons(polygons(&mesh, &columns)),
     };
     let chunks = chunks(&mesh, &surface, rate)?;
+    let falls_short = |face: &u32| match &surface {
+        Surface::Polygons(polygons) => polygons.falls_short(*face, rate),
+        Surface::CatmullClark(prepared) => prepared.falls_short(*face),
+    };
+    let short = chunks.iter().flatten().filter(|face| falls_short(face)).count();
+    report.skip("finer parts of faces that have 256 along an edge and would need more", short as u64);
     let own_step = || emit::power_of_two(emit::resolution(mesh.bounds().size().max_element()));
     let step = step.unwrap_or_else(own_step);
     for batch in chunks.chunks(2 * rayon::current_num_threads()) {
@@ -112,24 +119,27 @@ fn take_thin(mesh: &mut Mesh, report: &mut ImportReport) -> Result<Mesh> {
     Ok(thin)
 }
 
-/// The faces of a mesh as a cage; those that cannot be one are dropped and counted.
+/// The faces of a mesh as a cage, holes among them; those that cannot be one are dropped and counted.
 fn cage(mesh: &mut Mesh, columns: &Columns, report: &mut ImportReport) -> Cage {
     let mut seen = std::collections::HashSet::new();
+    let positions = &mesh.positions;
+    let mut is_good = |corners: &[u32]| {
+        seen.clear();
+        corners.iter().all(|&corner| is_usable(positions[corner as usize]) && seen.insert(corner))
+    };
+    let subdivision = mesh.subdivision.as_ref().expect("a mesh with a surface");
     let faces = std::mem::take(&mut mesh.faces);
     let (mut bad, mut kept) = (0, Vec::with_capacity(faces.len()));
     for face in faces {
-        let corners = mesh.face_corners(&face);
-        seen.clear();
-        let is_good = corners.iter().all(|&c| is_usable(mesh.positions[c as usize]) && seen.insert(c));
-        if is_good { kept.push(face) } else { bad += 1 }
+        let corners = face.start as usize..(face.start + face.arity) as usize;
+        if is_good(&mesh.corners[corners]) { kept.push(face) } else { bad += u64::from(!face.hole) }
     }
     report.skip("faces of subdivision surfaces with a repeated or impossible point", bad);
+    let seams = subdivision.seams;
     mesh.faces = kept;
-    let subdivision = mesh.subdivision.as_ref().expect("a mesh with a surface");
     let mut cage = Cage {
         positions: mesh.positions.clone(),
         smooth_width: columns.smooth.iter().map(|column| column.components).sum(),
-        linear_width: columns.linear.iter().map(|column| column.components).sum(),
         creases: subdivision.creases.clone(),
         sharp_points: subdivision.sharp_points.clone(),
         sharp_corners: subdivision.sharp_corners,
@@ -138,8 +148,19 @@ fn cage(mesh: &mut Mesh, columns: &Columns, report: &mut ImportReport) -> Cage {
     for face in &mesh.faces {
         cage.corners.extend_from_slice(mesh.face_corners(face));
         cage.ends.push(cage.corners.len() as u32);
-        for corner in face.start..face.start + face.arity {
-            columns.linear.iter().for_each(|column| column.push(mesh, corner as usize, &mut cage.linear));
+    }
+    let corners =
+        || mesh.faces.iter().flat_map(|face| face.start as usize..(face.start + face.arity) as usize);
+    if seams == Seams::Linear {
+        cage.linear_width = columns.linear.iter().map(|column| column.components).sum();
+        corners().for_each(|corner| {
+            columns.linear.iter().for_each(|own| own.push(mesh, corner, &mut cage.linear))
+        });
+    } else {
+        for column in &columns.linear {
+            let mut values = Vec::new();
+            corners().for_each(|corner| column.push(mesh, corner, &mut values));
+            cage.add_skin(&values, column.components, seams);
         }
     }
     for position in 0..mesh.positions.len() {
@@ -171,6 +192,7 @@ fn chunks(mesh: &Mesh, surface: &Surface<'_>, rate: &Rate) -> Result<Vec<Vec<u32
     let spread = |x: f64| (0..20).fold(0_u64, |sum, bit| sum | ((x as u64) >> bit & 1) << (3 * bit));
     let mut order: Vec<(u64, u32, u64)> = (0..mesh.faces.len() as u32)
         .into_par_iter()
+        .filter(|&face| !mesh.faces[face as usize].hole)
         .map(|face| {
             let (center, count) = match surface {
                 Surface::Polygons(polygons) => (polygons.center(face), polygons.estimate(face, rate)),
@@ -198,135 +220,6 @@ fn chunks(mesh: &Mesh, surface: &Surface<'_>, rate: &Rate) -> Result<Vec<Vec<u32
     }
     chunks.push(chunk);
     Ok(chunks)
-}
-
-/// What a column of values is in a mesh.
-#[derive(Clone, Copy)]
-enum Kind {
-    Color,
-    Opacity,
-    Extra(usize),
-}
-
-/// A column of values that dicing interpolates.
-struct Column {
-    kind: Kind,
-    components: usize,
-}
-
-/// The values of a mesh that dicing interpolates: those of points with the surface, those of corners within faces.
-struct Columns {
-    smooth: Vec<Column>,
-    linear: Vec<Column>,
-}
-
-impl Columns {
-    fn of(mesh: &Mesh) -> Self {
-        let mut columns = Self { smooth: Vec::new(), linear: Vec::new() };
-        let (color, opacity) =
-            (Column { kind: Kind::Color, components: 3 }, Column { kind: Kind::Opacity, components: 1 });
-        if !mesh.variant_colors.is_empty() {
-            columns.linear.push(color);
-        } else if !mesh.colors.is_empty() {
-            columns.smooth.push(color);
-        }
-        if !mesh.variant_opacities.is_empty() {
-            columns.linear.push(opacity);
-        } else if !mesh.opacities.is_empty() {
-            columns.smooth.push(opacity);
-        }
-        for (number, extra) in mesh.extras.iter().enumerate() {
-            let column = Column { kind: Kind::Extra(number), components: extra.components };
-            match extra.rate {
-                ExtraRate::Constant => {}
-                ExtraRate::Position => columns.smooth.push(column),
-                ExtraRate::Variant => columns.linear.push(column),
-            }
-        }
-        columns
-    }
-
-    /// Diced faces as a mesh of their own.
-    fn mesh(&self, from: &Mesh, diced: Diced, step: f64) -> Mesh {
-        let mut mesh = Mesh {
-            positions: diced.positions.iter().map(|p| (*p / step).round() * step).collect(),
-            palette: from.palette.clone(),
-            extras: from.extras.clone(),
-            ..Mesh::default()
-        };
-        mesh.normals = diced.normals;
-        if mesh.normals.contains(&Vec3::ZERO) {
-            // A zero normal would pass for a given one
-            let numbers = mesh.normals.iter().enumerate();
-            let numbers: Vec<u32> = numbers
-                .map(|(i, normal)| if *normal == Vec3::ZERO { super::mesh::NO_NORMAL } else { i as u32 })
-                .collect();
-            let used = diced.faces.iter().flat_map(|face| face.iter().filter(|&&v| v != NO_POINT));
-            mesh.corner_normals = used.map(|&vertex| numbers[vertex as usize]).collect();
-        }
-        let number = |&point: &u32| match point {
-            NO_POINT => NO_POINT,
-            point => from.point_numbers.get(point as usize).copied().unwrap_or(point),
-        };
-        mesh.point_numbers = diced.points.iter().map(number).collect();
-        for (face, &source) in diced.faces.iter().zip(&diced.sources) {
-            let arity = face.iter().filter(|&&vertex| vertex != NO_POINT).count();
-            let start = mesh.corners.len() as u32;
-            mesh.corners.extend_from_slice(&face[..arity]);
-            mesh.faces.push(Face { start, arity: arity as u32, ..from.faces[source as usize] });
-        }
-        self.spread(&diced.values, mesh.positions.len(), &mut mesh);
-        mesh
-    }
-
-    /// Takes rows of values apart.
-    fn spread(&self, values: &[f32], count: usize, mesh: &mut Mesh) {
-        let width: usize = self.smooth.iter().chain(&self.linear).map(|column| column.components).sum();
-        let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
-        let mut first = 0;
-        for Column { kind, components } in self.smooth.iter().chain(&self.linear) {
-            let value = |row: usize, i: usize| values[row * width + first + i];
-            match kind {
-                Kind::Color => {
-                    mesh.colors = (0..count).map(|row| [0, 1, 2].map(|i| byte(value(row, i)))).collect();
-                }
-                Kind::Opacity => mesh.opacities = (0..count).map(|row| byte(value(row, 0))).collect(),
-                Kind::Extra(number) => {
-                    let all = (0..count).flat_map(|row| (0..*components).map(move |i| (row, i)));
-                    let values = all.map(|(row, i)| value(row, i)).collect();
-                    mesh.extras[*number] =
-                        Extra { components: *components, rate: ExtraRate::Position, values };
-                }
-            }
-            first += components;
-        }
-    }
-}
-
-impl Column {
-    /// Appends the value at a corner.
-    fn push(&self, mesh: &Mesh, corner: usize, out: &mut Vec<f32>) {
-        self.push_at(mesh, mesh.corners[corner] as usize, mesh.variant(corner), out);
-    }
-
-    /// Appends the value at a position and a variant.
-    fn push_at(&self, mesh: &Mesh, position: usize, variant: Option<u32>, out: &mut Vec<f32>) {
-        let variant_index = variant.map_or(usize::MAX, |variant| variant as usize);
-        match self.kind {
-            Kind::Color => {
-                let own = mesh.variant_colors.get(variant_index).or_else(|| mesh.colors.get(position));
-                out.extend(own.copied().unwrap_or([128; 3]).map(f32::from));
-            }
-            Kind::Opacity => {
-                let own = mesh.variant_opacities.get(variant_index).or_else(|| mesh.opacities.get(position));
-                out.push(f32::from(own.copied().unwrap_or(255)));
-            }
-            Kind::Extra(number) => match mesh.extras[number].at(position, variant) {
-                Some(value) => out.extend_from_slice(value),
-                None => out.resize(out.len() + self.components, 0.0),
-            },
-        }
-    }
 }
 
 /// A rate for a prototype: that of the copy that needs the finest, in the prototype's own units, near `center`.

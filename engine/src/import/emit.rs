@@ -402,7 +402,7 @@ mod tests {
     use crate::import::cut;
     use std::collections::BTreeMap;
 
-    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
     /// A bumpy sheet of `n` by `n` quads, of decimals that single precision does not hold.
     fn sheet(n: u32) -> Mesh {

@@ -26,6 +26,8 @@ pub(super) struct Face {
     pub object: u32,
     /// Its opacity, 255 is opaque.
     pub opacity: u8,
+    /// Whether it shapes the surface of a cage and is no part of it.
+    pub hole: bool,
 }
 
 /// Positions, faces over them, and what vertices carry.
@@ -76,6 +78,8 @@ pub(super) struct Subdivision {
     pub sharp_points: HashMap<u32, f32>,
     /// Whether points of one face alone are sharp.
     pub sharp_corners: bool,
+    /// How what differs between the corners of a position follows the surface.
+    pub seams: crate::dice::Seams,
 }
 
 /// Values of an attribute that the engine hands on without reading it.
@@ -178,6 +182,11 @@ impl Mesh {
     pub fn has_opacity(&self) -> bool {
         self.opacities.iter().chain(&self.variant_opacities).any(|&opacity| opacity < 255)
             || self.faces.iter().any(|face| face.opacity < 255)
+    }
+
+    /// Takes out the faces that are holes.
+    pub fn open_holes(&mut self) {
+        self.faces.retain(|face| !face.hole);
     }
 
     /// Makes faces usable, and computes the normals that are missing. Indices must be in range.
@@ -350,7 +359,7 @@ pub(super) fn is_usable(position: DVec3) -> bool {
 mod tests {
     use super::*;
 
-    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+    const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
     fn mesh(positions: &[[f64; 3]], faces: &[&[u32]]) -> (Mesh, ImportReport) {
         let mut report = ImportReport::default();

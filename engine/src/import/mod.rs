@@ -7,6 +7,7 @@
 
 mod assembly;
 mod budget;
+mod columns;
 mod confine;
 mod cut;
 mod diced;
@@ -28,6 +29,8 @@ mod usd;
 mod assets;
 #[cfg(test)]
 mod hostile;
+#[cfg(test)]
+mod malformed;
 
 use std::path::Path;
 

@@ -84,7 +84,14 @@ mod tests {
         let mut mesh = Mesh::default();
         for place in places {
             let start = mesh.corners.len() as u32;
-            mesh.faces.push(Face { start: start as _, arity: 1, material: 0, object: 0, opacity: 255 });
+            mesh.faces.push(Face {
+                start: start as _,
+                arity: 1,
+                material: 0,
+                object: 0,
+                opacity: 255,
+                hole: false,
+            });
             mesh.corners.push(mesh.positions.len() as u32);
             mesh.positions.push(place);
         }

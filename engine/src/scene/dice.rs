@@ -36,7 +36,7 @@ impl Dice {
     pub fn parse(text: &str) -> Result<Self> {
         let wrong = || {
             Error::invalid(format!(
-                "`{text}` says not how to dice, expected `world:SIZE`, `camera:NAME[:PIXELS]` or `texels:N`"
+                "`{text}` is no way to dice, expected one of `world:SIZE`, `camera:NAME[:PIXELS]`, `texels:N`"
             ))
             .hint("a size is in scene units: `world:0.01`; leaves are cut along their texture: `world:0.01,texels:4`")
         };

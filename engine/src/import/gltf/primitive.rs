@@ -15,7 +15,7 @@ use crate::import::mesh::{Face, Mesh};
 use crate::import::{ImportReport, polygon, srgb};
 use crate::{Error, ErrorKind, Result};
 
-const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
 /// A material as far as it is read.
 pub(super) struct Surface {

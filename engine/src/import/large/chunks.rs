@@ -151,7 +151,14 @@ impl Sorted {
         for record in &records {
             let (start, arity) = (mesh.corners.len() as u32, record.arity());
             let records::Face { material, object, opacity, .. } = *record;
-            mesh.faces.push(Face { start, arity: arity as u32, material, object, opacity: opacity as u8 });
+            mesh.faces.push(Face {
+                start,
+                arity: arity as u32,
+                material,
+                object,
+                opacity: opacity as u8,
+                hole: false,
+            });
             mesh.corners.extend_from_slice(&record.corners[..arity]);
             given.extend_from_slice(&record.normals[..arity]);
         }

@@ -159,7 +159,7 @@ impl Spill {
             let start = mesh.corners.len() as u32;
             mesh.corners.extend(own.iter().step_by(2));
             mesh.corner_normals.extend(own.iter().skip(1).step_by(2));
-            mesh.faces.push(Face { start, arity, material, object, opacity: opacity as u8 });
+            mesh.faces.push(Face { start, arity, material, object, opacity: opacity as u8, hole: false });
             rest = tail;
         }
         let numbers = renumber(&mut mesh.corners);

@@ -29,6 +29,7 @@ fn fill(elements: &mut Elements<'_>, n: u32, place: DVec3) -> ImportReport {
             material: 0,
             object: i % 3,
             opacity: if i.is_multiple_of(5) { 9 } else { 255 },
+            hole: false,
         };
         let corners = match i % 11 {
             0 => &quad[..3],

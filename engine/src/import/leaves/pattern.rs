@@ -130,7 +130,7 @@ impl Pattern {
         let mut mesh = Mesh { positions: texels(averager, uv, &points), ..Mesh::default() };
         for (part, opacity) in kept {
             conform(part, &numbers, &mut |part| {
-                let face = Face { start: 0, arity: 0, material: 0, object: 0, opacity };
+                let face = Face { start: 0, arity: 0, material: 0, object: 0, opacity, hole: false };
                 let corners = part.map(|point| numbers[&point]);
                 mesh.push_face(face, &corners, &mut ImportReport::default())
             })?;

@@ -23,7 +23,7 @@ fn cut(alpha: AlphaMode, texels: f64) -> (Collect, ImportReport) {
     let texture = Texture::square(SIZE as u32, image);
     let mut card = Mesh::default();
     let mut report = ImportReport::default();
-    let face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+    let face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
     card.positions = CORNERS.map(DVec3::from).into();
     card.colors = vec![[255; 3]; 4];
     card.push_face(face, &[0, 1, 2], &mut report).unwrap();

@@ -249,7 +249,7 @@ impl<'a> State<'a> {
                 *self.id.insert(id)
             }
         };
-        Ok(Face { start: 0, arity: 0, material: self.material, object, opacity: self.opacity })
+        Ok(Face { start: 0, arity: 0, material: self.material, object, opacity: self.opacity, hole: false })
     }
 
     fn use_material(&mut self, name: &[u8], report: &mut ImportReport) {

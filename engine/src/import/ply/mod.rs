@@ -19,7 +19,7 @@ use crate::{Error, ErrorKind, Result};
 const POLYGON_MAX: u64 = 1 << 16;
 
 /// A face of nothing in particular.
-const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
 /// Imports a PLY file.
 pub(super) fn import(path: &Path, options: &ImportOptions, sink: &mut dyn GridSink) -> Result<ImportReport> {

@@ -80,9 +80,14 @@ pub(super) fn apply(
             }
         }
     }
-    let before = mesh.faces.len();
-    mesh.faces.retain(|face| face.material == 0 || face.opacity > 0);
-    report.skip("faces that are wholly clear", (before - mesh.faces.len()) as u64);
+    // What is wholly clear shapes the surface of a cage all the same
+    let is_clear = |face: &Face| face.material != 0 && face.opacity == 0 && !face.hole;
+    report
+        .skip("faces that are wholly clear", mesh.faces.iter().filter(|face| is_clear(face)).count() as u64);
+    mesh.faces.iter_mut().filter(|face| is_clear(face)).for_each(|face| face.hole = true);
+    if mesh.subdivision.is_none() {
+        mesh.open_holes();
+    }
     Ok(leaves)
 }
 

@@ -15,7 +15,7 @@ use crate::Result;
 use crate::import::mesh::Face;
 use crate::stream::Attribute;
 
-const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
 /// Lines of a span at most.
 const LINES_MAX: f64 = 32.0;
@@ -51,20 +51,13 @@ pub(super) fn read(stage: &Stage, prim: &Prim, part: usize, attributes: &[Attrib
         let found = points.len();
         return Err(stage.broken(path, format!("{found} points, `curveVertexCounts` has {total}")));
     }
-    let text = |name| stage.text(path, name);
-    let basis = match (text("type").as_deref(), text("basis").as_deref()) {
-        (Some("linear"), _) => Basis::Linear,
-        (_, Some("bspline")) => Basis::BSpline,
-        (_, Some("catmullRom")) => Basis::CatmullRom,
-        _ => Basis::Bezier,
-    };
-    let wrap = match text("wrap").as_deref() {
-        Some("periodic") => Wrap::Periodic,
-        Some("pinned") => Wrap::Pinned,
-        _ => Wrap::Open,
-    };
+    let (basis, wrap) = kind(stage, path)?;
     let sizes = Sizes::of(basis, wrap, &counts);
-    let widths = widths(stage, prim).filter(|widths| widths.len() >= sizes.count(widths.interpolation));
+    let mut widths = widths(stage, prim);
+    if widths.as_ref().is_some_and(|widths| widths.len() < sizes.count(widths.interpolation)) {
+        geometry.report.skip("widths without a value for every point", u64::from(part == 0));
+        widths = None;
+    }
     let all = widths.iter().flat_map(|widths| &widths.values);
     let width_max = f64::from(all.copied().fold(0.0, f32::max));
     let mut sampler = Sampler { basis, wrap, points: &points, width_max, samples: Vec::new(), ends: 0 };
@@ -84,6 +77,29 @@ pub(super) fn read(stage: &Stage, prim: &Prim, part: usize, attributes: &[Attrib
     let elements = Elements { faces: 1, points: samples.len(), corners: samples.len(), corner_sources: &[] };
     dress(stage, prim, attributes, &elements, &resample, mesh, report);
     Ok(geometry)
+}
+
+/// What a prim's points mean, and how its curves end; the schema's fallbacks are cubic Bézier curves that end where they do.
+fn kind(stage: &Stage, path: &str) -> Result<(Basis, Wrap)> {
+    let text = |name, fallback: &str| stage.text(path, name).unwrap_or_else(|| fallback.into());
+    let unknown = |name, found: &str, expected| {
+        Err(stage.broken(path, format!("curves of {name} `{found}`, expected one of {expected}")))
+    };
+    let basis = match (text("type", "cubic").as_str(), text("basis", "bezier").as_str()) {
+        ("linear", _) => Basis::Linear,
+        ("cubic", "bezier") => Basis::Bezier,
+        ("cubic", "bspline") => Basis::BSpline,
+        ("cubic", "catmullRom") => Basis::CatmullRom,
+        ("cubic", other) => return unknown("basis", other, "`bezier`, `bspline`, `catmullRom`"),
+        (other, _) => return unknown("type", other, "`linear`, `cubic`"),
+    };
+    let wrap = match text("wrap", "nonperiodic").as_str() {
+        "nonperiodic" => Wrap::Open,
+        "periodic" => Wrap::Periodic,
+        "pinned" => Wrap::Pinned,
+        other => return unknown("wrap", other, "`nonperiodic`, `periodic`, `pinned`"),
+    };
+    Ok((basis, wrap))
 }
 
 /// The number of the control point that a sample is, if it is one.

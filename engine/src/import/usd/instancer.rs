@@ -4,8 +4,8 @@ use std::collections::HashSet;
 
 use glam::{DMat4, DQuat, DVec3};
 
-use super::value;
 use super::walk::Walk;
+use super::{primvar, value};
 use crate::Result;
 use crate::import::assembly::Use;
 
@@ -22,8 +22,11 @@ pub(super) fn place(
     let targets = targets.map_err(|error| stage.broken(path, format!("{error:#}")))?;
     let mut scopes = Vec::with_capacity(targets.len());
     for target in &targets {
-        scopes.push(walk.scope(target.as_str(), DMat4::IDENTITY, nesting + 1)?);
+        let is_there = stage.stage.prim(target.as_str()).is_valid().unwrap_or(false);
+        let scope = is_there.then(|| walk.scope(target.as_str(), DMat4::IDENTITY, nesting + 1));
+        scopes.push(scope.transpose()?);
     }
+    walk.leave_out_primvars(primvar::of_prim(stage, path, &[]).len());
     let indices = stage.integers(path, "protoIndices").unwrap_or_default();
     let positions =
         stage.value(path, "positions").and_then(|value| value::vectors(&value)).unwrap_or_default();
@@ -48,15 +51,18 @@ pub(super) fn place(
                 .warn(format!("`{path}` has {count} {name} for {expected} copies: the rest has none"));
         }
     }
-    let hidden: HashSet<i64> = stage.integers(path, "invisibleIds").unwrap_or_default().into_iter().collect();
+    let mut hidden: HashSet<i64> =
+        stage.integers(path, "invisibleIds").unwrap_or_default().into_iter().collect();
+    hidden.extend(stage.prim_list(path, "inactiveIds"));
     let ids = stage.integers(path, "ids").filter(|ids| ids.len() == indices.len());
     let mut is_listed = vec![false; scopes.len()];
     for (i, (&index, &position)) in indices.iter().zip(&positions).enumerate() {
         if hidden.contains(&ids.as_ref().map_or(i as i64, |ids| ids[i])) {
-            walk.found.report.skip("invisible copies", 1);
+            walk.found.report.skip("invisible and inactive copies", 1);
             continue;
         }
-        let Some(number) = usize::try_from(index).ok().filter(|&index| index < scopes.len()) else {
+        let number = usize::try_from(index).ok();
+        let Some((number, scope)) = number.and_then(|number| Some((number, (*scopes.get(number)?)?))) else {
             walk.found.report.skip("copies of a prototype that is not there", 1);
             continue;
         };
@@ -65,7 +71,7 @@ pub(super) fn place(
         let outer_from_inner =
             scope_from_prim * DMat4::from_scale_rotation_translation(scale, rotation, position);
         let listed = !std::mem::replace(&mut is_listed[number], true);
-        walk.place(Use { scope: scopes[number], outer_from_inner, listed, placed: true }, uses);
+        walk.place(Use { scope, outer_from_inner, listed, placed: true }, uses);
     }
     Ok(())
 }

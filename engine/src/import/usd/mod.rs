@@ -4,6 +4,8 @@
 //! each prim becomes a mesh when its turn comes. What stands once is written as it is, each prototype once for all its
 //! copies.
 
+#[cfg(test)]
+mod aloud_tests;
 mod basis;
 mod cover;
 mod curves;
@@ -205,10 +207,14 @@ impl Import<'_> {
         let Geometry { mut mesh, report: own, covers } = self.reader.geometry(which.0, which.1)?;
         *report = own;
         let is_surface = self.options.dice.is_some() && mesh.subdivision.is_some();
+        if !is_surface {
+            mesh.open_holes();
+        }
         let cut = Leaves::are_wanted(self.options) && !is_surface;
         let leaves = cover::apply(&mut mesh, covers, &self.attributes, cut, report)?;
         // Dicing finishes what it makes, and needs the polygons of a surface as they are
         let raw = is_surface.then(|| mesh.clone());
+        mesh.open_holes();
         mesh.finish(report)?;
         let clusters = cut::cut(&mesh);
         let radius = radius::default_radius(&mesh, &clusters, self.options.meters_per_unit);

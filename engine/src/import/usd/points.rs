@@ -10,7 +10,7 @@ use crate::Result;
 use crate::import::mesh::Face;
 use crate::stream::Attribute;
 
-const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
 /// Reads points.
 pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {

@@ -1,6 +1,6 @@
 //! Mesh prims: points, polygons, normals.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use glam::Vec3;
 
@@ -10,12 +10,13 @@ use super::primvar::{self, Interpolation, Primvar, Values};
 use super::read::{Geometry, Stage};
 use super::value;
 use super::walk::Prim;
-use crate::dice::SHARP;
+use crate::dice::{NO_POINT, SHARP, Seams};
+use crate::import::ImportReport;
 use crate::import::mesh::{Face, Mesh, NO_NORMAL, Subdivision};
 use crate::stream::Attribute;
 use crate::{Error, ErrorKind, Result};
 
-const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255 };
+const FACE: Face = Face { start: 0, arity: 0, material: 0, object: 0, opacity: 255, hole: false };
 
 /// Reads a mesh.
 pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Result<Geometry> {
@@ -38,19 +39,15 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
     // Faces, in the order of their front
     let is_left_handed =
         stage.text(path, "orientation").is_some_and(|orientation| orientation == "leftHanded");
-    let holes = stage.integers(path, "holeIndices").unwrap_or_default();
+    let holes: HashSet<i64> = stage.integers(path, "holeIndices").unwrap_or_default().into_iter().collect();
     let mut corner_sources = Vec::with_capacity(indices.len());
     let mut corners = Vec::new();
-    let mut next = 0_u32;
+    let (mut next, mut uncounted) = (0_u32, ImportReport::default());
     for (number, &count) in counts.iter().enumerate() {
         let range = next..next + count as u32;
         next = range.end;
         if count < 3 {
             report.skip("faces of fewer than three corners", 1);
-            continue;
-        }
-        if holes.binary_search(&(number as i64)).is_ok() || holes.contains(&(number as i64)) {
-            report.skip("faces that are holes", 1);
             continue;
         }
         corners.clear();
@@ -61,11 +58,19 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         corner_sources.extend(corners.iter().map(|&corner| (number as u32, corner)));
         corners.iter_mut().for_each(|corner| *corner = indices[*corner as usize] as u32);
         let material = materials.get(number).copied().unwrap_or(0);
-        mesh.push_face(Face { material, ..FACE }, &corners, report)?;
+        let hole = holes.contains(&(number as i64));
+        report.skip("faces that are holes", u64::from(hole));
+        let report = if hole { &mut uncounted } else { &mut *report };
+        mesh.push_face(Face { material, hole, ..FACE }, &corners, report)?;
     }
     let scheme = stage.text(path, "subdivisionScheme").unwrap_or_else(|| "catmullClark".into());
-    if scheme == "loop" {
-        report.skip("Loop subdivision surfaces, which are read as their polygons", 1);
+    match scheme.as_str() {
+        "catmullClark" => {
+            mesh.subdivision = Some(subdivision(stage, path, mesh, report));
+        }
+        "none" | "bilinear" => {}
+        "loop" => report.skip("Loop subdivision surfaces, which are read as their polygons", 1),
+        _ => report.skip("meshes of an unknown subdivision scheme, which are read as their polygons", 1),
     }
     let elements = Elements {
         faces: counts.len(),
@@ -73,9 +78,6 @@ pub(super) fn read(stage: &Stage, prim: &Prim, attributes: &[Attribute]) -> Resu
         corners: indices.len(),
         corner_sources: &corner_sources,
     };
-    if scheme == "catmullClark" {
-        mesh.subdivision = Some(subdivision(stage, path));
-    }
     // The normals of a cage are not those of the surface it stands for
     if scheme == "none" || scheme == "bilinear" {
         push_normals(stage, prim, &elements, mesh);
@@ -106,40 +108,82 @@ fn materials(covers: &[Cover], faces: usize) -> Vec<u32> {
     materials
 }
 
-/// The creases and corners of a subdivision surface. Lists that do not fit together end where they no longer do.
-fn subdivision(stage: &Stage, path: &str) -> Subdivision {
+/// The creases and corners of a subdivision surface. What does not fit the mesh is left out and counted.
+fn subdivision(stage: &Stage, path: &str, mesh: &Mesh, report: &mut ImportReport) -> Subdivision {
     let integers = |name| stage.integers(path, name).unwrap_or_default();
-    let sharpnesses = |name| stage.numbers(path, name).unwrap_or_default();
+    let numbers = |name| stage.numbers(path, name).unwrap_or_default();
     let clamp = |sharpness: f64| (sharpness as f32).clamp(0.0, SHARP);
     let boundary = stage.text(path, "interpolateBoundary");
     let mut found = Subdivision {
         sharp_corners: boundary.is_none_or(|boundary| boundary == "edgeAndCorner"),
+        seams: seams(stage, path, report),
         ..Subdivision::default()
     };
+
+    // Creases: one sharpness for each, or one for each of its edges
     let (points, lengths) = (integers("creaseIndices"), integers("creaseLengths"));
-    let values = sharpnesses("creaseSharpnesses");
-    // One sharpness for each crease, or one for each of its edges
-    let edges: i64 = lengths.iter().map(|length| (length - 1).max(0)).sum();
-    let per_edge = values.len() as i64 == edges && values.len() != lengths.len();
-    let (mut first, mut edge) = (0_usize, 0);
+    let values = numbers("creaseSharpnesses");
+    let sides: i64 =
+        lengths.iter().map(|length| length.saturating_sub(1).max(0)).fold(0, i64::saturating_add);
+    let per_side = values.len() as i64 == sides && values.len() != lengths.len();
+    let edges = if lengths.is_empty() { HashSet::new() } else { edges(mesh) };
+    let (mut first, mut side, mut lost) = (0_usize, 0, 0);
     for (crease, &length) in lengths.iter().enumerate() {
         let run = usize::try_from(length).ok().and_then(|n| points.get(first..first.checked_add(n)?));
-        let Some(run) = run else { break };
+        let Some(run) = run else {
+            lost += (lengths.len() - crease) as u64;
+            break;
+        };
         for ends in run.windows(2) {
-            let sharpness = values.get(if per_edge { edge } else { crease }).copied().unwrap_or(0.0);
-            if let [Ok(a), Ok(b)] = [ends[0], ends[1]].map(u32::try_from) {
-                found.creases.insert([a.min(b), a.max(b)], clamp(sharpness));
+            let ends = [ends[0].min(ends[1]), ends[0].max(ends[1])]
+                .map(|end| u32::try_from(end).unwrap_or(NO_POINT));
+            match values.get(if per_side { side } else { crease }) {
+                Some(&sharpness) if edges.contains(&ends) => _ = found.creases.insert(ends, clamp(sharpness)),
+                _ => lost += 1,
             }
-            edge += 1;
+            side += 1;
         }
         first += run.len();
     }
-    for (&point, &sharpness) in integers("cornerIndices").iter().zip(&sharpnesses("cornerSharpnesses")) {
-        if let Ok(point) = u32::try_from(point) {
-            found.sharp_points.insert(point, clamp(sharpness));
+    report.skip("creases of subdivision surfaces that lie on no edge or have no sharpness", lost);
+
+    // Corners
+    let (corners, values) = (integers("cornerIndices"), numbers("cornerSharpnesses"));
+    let mut lost = 0;
+    for (number, &point) in corners.iter().enumerate() {
+        let point = usize::try_from(point).ok().filter(|&point| point < mesh.positions.len());
+        match (point, values.get(number)) {
+            (Some(point), Some(&sharpness)) => _ = found.sharp_points.insert(point as u32, clamp(sharpness)),
+            _ => lost += 1,
         }
     }
+    report.skip("sharp corners of subdivision surfaces that are no point or have no sharpness", lost);
     found
+}
+
+/// How values of corners follow the surface.
+fn seams(stage: &Stage, path: &str, report: &mut ImportReport) -> Seams {
+    match stage.text(path, "faceVaryingLinearInterpolation").as_deref() {
+        Some("none") => Seams::Smooth,
+        Some("cornersOnly") => Seams::Corners,
+        Some("cornersPlus1") | None => Seams::Junctions,
+        Some("cornersPlus2") => Seams::Darts,
+        Some("boundaries") => Seams::Boundaries,
+        Some("all") => Seams::Linear,
+        Some(_) => {
+            report.skip("unknown rules of faceVarying interpolation, read as `cornersPlus1`", 1);
+            Seams::Junctions
+        }
+    }
+}
+
+/// The edges of all faces, the lower end first.
+fn edges(mesh: &Mesh) -> HashSet<[u32; 2]> {
+    let sides = |face: &Face| {
+        let corners = mesh.face_corners(face);
+        (0..corners.len()).map(|i| [corners[i], corners[(i + 1) % corners.len()]])
+    };
+    mesh.faces.iter().flat_map(sides).map(|[a, b]| [a.min(b), a.max(b)]).collect()
 }
 
 /// Refuses a mesh whose numbers do not fit together, or that needs more memory than allowed.

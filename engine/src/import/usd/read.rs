@@ -107,6 +107,16 @@ impl Stage {
         self.stage.attribute(format!("{prim}.{attribute}")).get_metadata::<Value>(field).ok().flatten()
     }
 
+    /// A list of whole numbers in a prim's metadata, such as `inactiveIds`.
+    pub fn prim_list(&self, prim: &str, field: &str) -> Vec<i64> {
+        // The library reads any field by its object's path, and offers it for attributes
+        match self.stage.attribute(prim).get_metadata::<Value>(field).ok().flatten() {
+            Some(Value::Int64ListOp(list)) => list.flatten(),
+            Some(value) => super::value::integers(&value).unwrap_or_default(),
+            None => Vec::new(),
+        }
+    }
+
     /// Reads a part of a prim; `attributes` are those that primvars become.
     pub fn geometry(&self, prim: &Prim, part: usize, attributes: &[Attribute]) -> Result<Geometry> {
         match prim.kind {

@@ -57,7 +57,7 @@ const SQUARE: &str = "int[] faceVertexCounts = [4]
     point3f[] points = [(0,0,0), (1,0,0), (1,1,0), (0,1,0)]
     uniform token subdivisionScheme = \"none\"\n";
 
-fn mesh(name: &str, more: &str) -> String {
+pub(super) fn mesh(name: &str, more: &str) -> String {
     format!("def Mesh \"{name}\" {{\n    {SQUARE}{more}\n}}\n")
 }
 

@@ -91,6 +91,9 @@ pub(super) fn catalogue(stage: &Stage) -> Result<Catalogue> {
         report: ImportReport::default(),
     };
     let mut walk = Walk { stage, found, scopes: HashMap::new(), visited: 0, uses: 0 };
+    if let Some(odd) = meters_per_unit(stage).filter(|units| !is_length(*units)) {
+        walk.found.report.warn(format!("`metersPerUnit` is {odd}: centimetres are assumed"));
+    }
     walk.scope("/", world_from_stage(stage, space), 0)?;
     let found = &mut walk.found;
     for error in stage.stage.composition_errors() {
@@ -130,13 +133,22 @@ pub(super) fn catalogue(stage: &Stage) -> Result<Catalogue> {
 
 /// Metres per unit and up axis of a stage; the schema's fallbacks are centimetres and +y.
 fn space(stage: &Stage) -> (f64, UpAxis) {
-    let field = |name| stage.stage.stage_metadata(name).ok().flatten();
-    let number = field("metersPerUnit").and_then(|value| super::value::numbers(&value)?.first().copied());
-    let up = field("upAxis").and_then(|value| super::value::text(&value));
+    let up = stage.stage.stage_metadata("upAxis").ok().flatten();
+    let up = up.and_then(|value| super::value::text(&value));
     (
-        number.filter(|x| x.is_finite() && *x > 0.0).unwrap_or(0.01),
+        meters_per_unit(stage).filter(|units| is_length(*units)).unwrap_or(0.01),
         if up.is_some_and(|axis| axis == "Z") { UpAxis::Z } else { UpAxis::Y },
     )
+}
+
+/// Metres per unit as the stage says, if it does.
+fn meters_per_unit(stage: &Stage) -> Option<f64> {
+    let value = stage.stage.stage_metadata("metersPerUnit").ok().flatten()?;
+    super::value::numbers(&value)?.first().copied()
+}
+
+fn is_length(units: f64) -> bool {
+    units.is_finite() && units > 0.0
 }
 
 /// World from stage: from its units and up axis to the scene's.
@@ -284,8 +296,9 @@ impl Walk<'_> {
             "BasisCurves" => Some(Kind::Curves),
             _ => None,
         };
+        let is_instance = prim.is_instance().map_err(wrong)?;
         let is_shown = &*purpose == "default" || &*purpose == "render";
-        if (kind.is_some() || type_name == "PointInstancer") && !is_shown {
+        if (kind.is_some() || type_name == "PointInstancer" || is_instance) && !is_shown {
             self.found.report.skip(&format!("prims of purpose `{purpose}`"), 1);
             return Ok(Vec::new());
         }
@@ -327,7 +340,8 @@ impl Walk<'_> {
             }
             (None, other) => self.found.report.skip(&format!("prims of type `{other}`"), 1),
         }
-        if prim.is_instance().map_err(wrong)? {
+        if is_instance {
+            self.leave_out_primvars(primvar::inherit(self.stage, path, &node.inherited).len());
             if let Some(prototype) = prim.prototype().map_err(wrong)? {
                 let scope = self.scope(prototype.as_str(), DMat4::IDENTITY, nesting + 1)?;
                 self.place(
@@ -342,6 +356,13 @@ impl Walk<'_> {
             None => primvar::inherit(self.stage, path, &node.inherited),
         };
         self.children(node, scope_from_prim, &inherited, &purpose)
+    }
+
+    /// Counts the primvars of a copy: copies share what their prototype has.
+    pub fn leave_out_primvars(&mut self, count: usize) {
+        self.found
+            .report
+            .skip("primvars of instances and instancers, whose copies share their prototype's", count as u64);
     }
 
     /// Adds a use; one whose transform is flat is counted, but not to be seen.
