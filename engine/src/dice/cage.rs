@@ -122,8 +122,12 @@ impl Prepared<'_> {
 
     /// The given faces and all around them, in order.
     pub(super) fn with_neighbours(&self, faces: &[u32]) -> Vec<u32> {
-        let inner = faces.iter().flat_map(|&face| &self.cage.corners[self.cage.face(face)]);
-        let mut numbers: Vec<u32> = inner.flat_map(|&point| self.faces_of(point)).copied().collect();
+        let mut points =
+            faces.iter().flat_map(|&face| &self.cage.corners[self.cage.face(face)]).collect::<Vec<_>>();
+        points.sort_unstable();
+        points.dedup();
+        let mut numbers: Vec<u32> =
+            points.into_iter().flat_map(|&point| self.faces_of(point)).copied().collect();
         numbers.sort_unstable();
         numbers.dedup();
         numbers

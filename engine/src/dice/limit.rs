@@ -9,11 +9,18 @@ use super::level::{Level, NONE};
 use super::refine::add;
 use crate::math::trig::cos_sin_turns;
 
+/// Faces around a vertex that are looked at, at most: each of them asks for the vertex. With more it counts as sharp.
+pub(super) const VALENCE_MAX: usize = 1024;
+
 /// Values of a vertex on the limit surface. All faces around it must be quads.
 pub(super) fn row(level: &Level, vertex: u32) -> Vec<f64> {
     let own = level.row(vertex);
+    let is_crowded = level.corners_of(vertex).len() > VALENCE_MAX;
+    if is_crowded || level.vertex_sharpness[vertex as usize] > 0.0 {
+        return own.to_vec();
+    }
     let (count, creases) = level.sharp_edges(vertex);
-    if count > 2 || level.vertex_sharpness[vertex as usize] > 0.0 {
+    if count > 2 {
         return own.to_vec();
     }
     let mut sum = vec![0.0; level.width];
@@ -34,8 +41,23 @@ pub(super) fn row(level: &Level, vertex: u32) -> Vec<f64> {
 }
 
 /// The unit normal of the limit surface at a corner of a face: that of the side of a crease that the face lies on. Zero
-/// where there is none.
+/// where there is none, and where more than [`VALENCE_MAX`] faces meet.
 pub(super) fn normal(level: &Level, corner: u32) -> Vec3 {
+    if level.corners_of(level.corners[corner as usize]).len() > VALENCE_MAX {
+        return Vec3::ZERO;
+    }
+    let normal = fan_normal(level, corner).normalize_or_zero();
+    if normal != DVec3::ZERO {
+        return normal.as_vec3();
+    }
+    // A cusp, or neighbours that fall together: the face itself
+    let at = |corner: usize| DVec3::from_slice(level.row(level.corners[corner]));
+    let face: Vec<DVec3> = level.face(level.corner_faces[corner as usize]).map(at).collect();
+    (face[2] - face[0]).cross(face[3] - face[1]).normalize_or_zero().as_vec3()
+}
+
+/// The cross product of the tangents of the fan of faces that a corner is in.
+fn fan_normal(level: &Level, corner: u32) -> DVec3 {
     let vertex = level.corners[corner as usize];
     let fan = Fan::around(level, corner);
     let at = |vertex: u32| DVec3::from_slice(level.row(vertex));
@@ -45,7 +67,7 @@ pub(super) fn normal(level: &Level, corner: u32) -> Vec3 {
     let edges: Vec<DVec3> = fan.edges.iter().map(|&vertex| at(vertex)).collect();
     let faces: Vec<DVec3> = fan.faces.iter().map(|&vertex| at(vertex)).collect();
     let (n, k) = (edges.len(), faces.len());
-    let normal = if fan.closed {
+    if fan.closed {
         let (mut s, mut t) = (DVec3::ZERO, DVec3::ZERO);
         let turn = |i: usize| cos_sin_turns(i as f64 / n as f64);
         let (c1, _) = turn(1);
@@ -73,15 +95,7 @@ pub(super) fn normal(level: &Level, corner: u32) -> Vec3 {
             }
         }
         (edges[0] - edges[n - 1]).cross(across)
-    };
-    let normal = normal.normalize_or_zero();
-    if normal != DVec3::ZERO {
-        return normal.as_vec3();
     }
-    // A cusp, or neighbours that fall together: the face itself
-    let face: Vec<DVec3> =
-        level.face(level.corner_faces[corner as usize]).map(|c| at(level.corners[c])).collect();
-    (face[2] - face[0]).cross(face[3] - face[1]).normalize_or_zero().as_vec3()
 }
 
 /// The faces around a vertex from one sharp edge to the next, counter-clockwise.

@@ -243,6 +243,24 @@ fn where_sheets_meet_the_surface_holds() {
     assert!((diced.positions[middle] - expected).length() < 1e-12, "{}", diced.positions[middle]);
 }
 
+/// Catches work or memory that grows with the square of the faces around a point.
+#[test]
+fn a_point_of_many_faces_ends_soon() {
+    let n = 40_000;
+    let mut cage = Cage { positions: vec![DVec3::ZERO], ..Cage::default() };
+    for i in 0..2 * n {
+        let (cos, sin) = crate::math::trig::cos_sin_turns(f64::from(i) / f64::from(2 * n));
+        cage.positions.push(DVec3::new(cos, sin, 0.0));
+    }
+    for i in 0..n {
+        cage.corners.extend([0, 2 * i + 1, 2 * i + 2, (2 * i + 2) % (2 * n) + 1]);
+        cage.ends.push(cage.corners.len() as u32);
+    }
+    let diced = dice(&cage, 0.6);
+    assert_eq!(diced.points.iter().filter(|&&point| point == 0).count(), 1);
+    assert!(diced.faces.len() > n as usize && diced.positions.iter().all(|p| p.length() < 1.0 + 1e-12));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 

@@ -21,6 +21,9 @@ const CHUNK_MAX: u64 = 1 << 17;
 /// Faces that a mesh may become.
 const FACES_MAX: u64 = 4_000_000_000;
 
+/// Corners of a cage's face at most.
+const CORNERS_MAX: usize = 1024;
+
 /// What a mesh is to be diced as: its faces, linearly, or the surface that they stand for.
 enum Surface<'a> {
     Polygons(Polygons),
@@ -125,7 +128,8 @@ fn cage(mesh: &mut Mesh, columns: &Columns, report: &mut ImportReport) -> Cage {
     let positions = &mesh.positions;
     let mut is_good = |corners: &[u32]| {
         seen.clear();
-        corners.iter().all(|&corner| is_usable(positions[corner as usize]) && seen.insert(corner))
+        corners.len() <= CORNERS_MAX
+            && corners.iter().all(|&corner| is_usable(positions[corner as usize]) && seen.insert(corner))
     };
     let subdivision = mesh.subdivision.as_ref().expect("a mesh with a surface");
     let faces = std::mem::take(&mut mesh.faces);
@@ -134,7 +138,7 @@ fn cage(mesh: &mut Mesh, columns: &Columns, report: &mut ImportReport) -> Cage {
         let corners = face.start as usize..(face.start + face.arity) as usize;
         if is_good(&mesh.corners[corners]) { kept.push(face) } else { bad += u64::from(!face.hole) }
     }
-    report.skip("faces of subdivision surfaces with a repeated or impossible point", bad);
+    report.skip("faces of subdivision surfaces with a repeated or impossible point, or too many", bad);
     let seams = subdivision.seams;
     mesh.faces = kept;
     let mut cage = Cage {

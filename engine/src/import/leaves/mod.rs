@@ -130,3 +130,5 @@ pub(super) fn check_count(count: u64, options: &ImportOptions) -> Result<()> {
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod trees;

@@ -1,15 +1,17 @@
-//! What a USD file may make the library read: files by count, size and nesting, counted before the library sees them.
+//! What a USD file may make the library read: files by count, size, nesting and classes, looked at before the library sees them.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::io::{self, Cursor, Read, Seek};
 use std::panic::resume_unwind;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::sync::atomic::Ordering;
 
-use openusd::ar::{Asset, DefaultResolver, ResolvedPath, Resolver};
+use openusd::ar::{Asset, DefaultResolver, ResolvedPath, Resolver, split_package_relative_path_outer};
 
+use super::arcs::ClassArcs;
 use super::fence::Stop;
+use super::{binary, package};
 use crate::{Error, ErrorKind};
 
 /// Files that one import may open.
@@ -29,6 +31,8 @@ pub(super) struct Guard {
     files: Cell<u32>,
     lookups: Cell<u64>,
     stop: Stop,
+    classes: RefCell<ClassArcs>,
+    memory_bytes: u64,
 }
 
 impl Guard {
@@ -42,6 +46,8 @@ impl Guard {
             files: Cell::new(0),
             lookups: Cell::new(0),
             stop,
+            classes: RefCell::default(),
+            memory_bytes: bytes_max,
         }
     }
 
@@ -105,12 +111,24 @@ impl Resolver for Guard {
     }
 
     fn open_asset(&self, resolved_path: &ResolvedPath) -> io::Result<Box<dyn Asset>> {
+        if let Some((package, _)) = split_package_relative_path_outer(&resolved_path.to_string())
+            && let Err(reason) = package::check(Path::new(&package))
+        {
+            throw(Error::new(ErrorKind::Unsupported, reason).at(&package));
+        }
         let mut asset = self.inner.open_asset(resolved_path)?;
         self.take(resolved_path, asset.size()?);
         let mut bytes = Vec::new();
         asset.rewind()?;
         asset.read_to_end(&mut bytes)?;
-        let checked = if bytes.starts_with(b"PXR-USDC") { Ok(()) } else { check_text(&bytes) };
+        let checked = match bytes.starts_with(b"PXR-USDC") {
+            true => binary::check(&bytes, self.memory_bytes),
+            false => check_text(&bytes),
+        };
+        let in_order = || self.classes.borrow_mut().add_layer(&bytes);
+        if let Some(reason) = checked.is_ok().then(in_order).and_then(Result::err) {
+            throw(Error::new(ErrorKind::Limit, reason).at(resolved_path));
+        }
         match checked {
             Ok(()) => Ok(Box::new(Cursor::new(bytes))),
             Err(reason) => Err(io::Error::new(io::ErrorKind::InvalidData, reason)),

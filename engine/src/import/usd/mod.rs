@@ -6,7 +6,9 @@
 
 #[cfg(test)]
 mod aloud_tests;
+mod arcs;
 mod basis;
+mod binary;
 mod cover;
 mod curves;
 mod dress;
@@ -14,6 +16,7 @@ mod fence;
 mod guard;
 mod instancer;
 mod material;
+mod package;
 mod points;
 mod polygons;
 mod primvar;

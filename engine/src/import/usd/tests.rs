@@ -384,6 +384,10 @@ fn bombs_hit_a_limit() {
     desk.layer("30.usda", &format!("(defaultPrim = \"A\")\ndef \"A\" {{ {} }}", mesh("m", "")));
     let error = read(&desk.0.path().join("0.usda"), &options).err().unwrap();
     assert_eq!(error.kind(), ErrorKind::Limit, "{error}");
+    // Classes in a circle, reached from outside
+    let circle = "class \"A\" (specializes = </B>) {}\nclass \"B\" (inherits = </A>) {}\ndef \"m\" (inherits = </A>) {}";
+    let error = outcome("circle.usda", circle).unwrap_err();
+    assert!(error.message().contains("in a circle"), "{error}");
     // A layer larger than the memory allowed
     let options = ImportOptions { memory_bytes: 1 << 20, ..options };
     let error = read(&desk.layer("large.usda", &" ".repeat(2 << 20)), &options).err().unwrap();
