@@ -164,6 +164,8 @@ fn shaders_have_outputs() {
     assert_eq!((&of("ambient")["components"], &of("bent_normal")["components"]), (&1.into(), &3.into()));
     assert!((0.3..=1.0).contains(&number(&of("ambient"), "/max/0")), "{summary}");
     assert!(number(&of("bent_normal"), "/max/1") > 0.8, "{summary}");
+    // 64 rays leave a few hundredths where something occludes
+    assert!((0.005..0.3).contains(&number(&of("sh_occlusion_error"), "/max/0")), "{summary}");
     json(["relight", &baked, "-o", &desk.at("ambient.png"), "--show", "ambient", "--size", "64x36"]);
     assert!(std::fs::read(desk.at("ambient.png")).unwrap().starts_with(b"\x89PNG"));
 }

@@ -4,6 +4,7 @@ use super::BakeOptions;
 use crate::batch::Point;
 use crate::scene::{BakeSet, Output, Scene, ShOcclusion, Shader, ShaderKind};
 use crate::shade::ambient;
+use crate::shade::sh_occlusion::half_split_error;
 use crate::stream::Attribute;
 use crate::trace::Shading;
 use crate::{Error, Result};
@@ -80,13 +81,18 @@ impl Run {
             ShaderKind::ShOcclusion(parameters) => {
                 let samples = options.samples.unwrap_or(parameters.samples);
                 let wanted = set.attributes.iter().filter(|attribute| attribute.shader == shader.name);
-                let all_coefficients = |output: &str| output == ShOcclusion::COEFFICIENTS;
-                let bands = match wanted.into_iter().all(|attribute| all_coefficients(&attribute.output)) {
-                    true => parameters.bands,
-                    false => parameters.bands.max(ambient::BANDS_MIN),
+                let wanted: Vec<&str> = wanted.map(|attribute| &*attribute.output).collect();
+                let of_band_one = [ShOcclusion::AMBIENT_OCCLUSION, ShOcclusion::BENT_NORMAL];
+                let bands = match wanted.iter().any(|output| of_band_one.contains(output)) {
+                    true => parameters.bands.max(ambient::BANDS_MIN),
+                    false => parameters.bands,
                 };
                 let traced = ShOcclusion { samples, bands, ..parameters.clone() };
-                let program = Program::Spherical(Shading::new(&traced, options.seed, &set.name, shift));
+                let mut shading = Shading::new(&traced, options.seed, &set.name, shift);
+                if wanted.contains(&ShOcclusion::ERROR) {
+                    shading = shading.with_halves();
+                }
+                let program = Program::Spherical(shading);
                 Self { shader: shader.clone(), samples, program }
             }
         }
@@ -97,7 +103,7 @@ impl Program {
     /// Numbers that are computed at a point.
     pub fn values(&self) -> usize {
         match self {
-            Self::Spherical(shading) => shading.coefficients(),
+            Self::Spherical(shading) => shading.values(),
         }
     }
 
@@ -105,6 +111,9 @@ impl Program {
     pub fn push_output(&self, output: &Output, point: &Point, values: &[f32], row: &mut Vec<f32>) {
         match self {
             Self::Spherical(_) if output.first == 0 => row.extend_from_slice(&values[..output.components]),
+            Self::Spherical(shading) if output.name == ShOcclusion::ERROR => {
+                row.push(half_split_error(&values[shading.coefficients()..]));
+            }
             Self::Spherical(shading) => {
                 let (normal, spread) = shading.spread(point.normal);
                 let has_normal = point.normal != glam::Vec3::ZERO;

@@ -15,6 +15,7 @@ const SCENE: &str = r#"<scene version="1" units="m" up="y">
       <attribute name="ambient" shader="occlusion" output="ambient_occlusion"/>
       <attribute name="sh" shader="occlusion"/>
       <attribute name="bent" shader="occlusion" output="bent_normal"/>
+      <attribute name="noise" shader="occlusion" output="error"/>
     </bakeset>
   </geometry></geometries>
 </scene>"#;
@@ -35,9 +36,11 @@ fn outputs_of_a_shader_share_its_rays() {
     let schema = stream.schema().clone();
     let column = |name: &str| schema.find(name).unwrap_or_else(|| panic!("no {name}"));
     let (ambient, sh, bent, normal) = (column("ambient"), column("sh"), column("bent"), column("N"));
-    let components = [ambient, sh, bent].map(|column| schema.attributes[column].components);
-    assert_eq!(components, [1, 9, 3]);
+    let noise = column("noise");
+    let components = [ambient, sh, bent, noise].map(|column| schema.attributes[column].components);
+    assert_eq!(components, [1, 9, 3, 1]);
     let (mut grid, mut points, mut open) = (Microgrid::default(), 0, 0.0);
+    let mut noise_sum = 0.0;
     while stream.next(&mut grid).unwrap() {
         for vertex in 0..grid.vertex_count() {
             let value = |column, component| grid.value(&schema, column, vertex, component);
@@ -48,10 +51,15 @@ fn outputs_of_a_shader_share_its_rays() {
             assert!((value(ambient, 0) - expected).abs() < 0.02, "{} {expected}", value(ambient, 0));
             let middle = grid.vec3(&schema, bent, vertex);
             assert!((middle - band.normalize()).length() < 1e-4, "{middle} {band}");
+            assert!((0.0..0.2).contains(&value(noise, 0)), "{}", value(noise, 0));
+            noise_sum += f64::from(value(noise, 0));
             (points, open) = (points + 1, open + f64::from(value(ambient, 0)));
         }
     }
     assert_eq!(points, report.bake.points);
+    // Halves of 64 rays differ by some hundredths
+    let mean = noise_sum / points as f64;
+    assert!((0.01..0.1).contains(&mean), "{mean}");
     // Hills see most of the sky, and not all of it
     let mean = open / points as f64;
     assert!((0.5..0.999).contains(&mean), "{mean}");

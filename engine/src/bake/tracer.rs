@@ -73,7 +73,7 @@ impl BatchTracer {
             })
             .collect();
         for (number, (shading, values)) in spherical.iter().zip(values).enumerate() {
-            values.resize(points.len() * shading.coefficients(), 0.0);
+            values.resize(points.len() * shading.values(), 0.0);
             let next = match spherical.get(number + 1) {
                 Some(shading) => Some((&points[..], *shading)),
                 None => next.map(|_| (&next_points[..], spherical[0])),

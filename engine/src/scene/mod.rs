@@ -174,6 +174,8 @@ impl ShOcclusion {
     pub const AMBIENT_OCCLUSION: &str = "ambient_occlusion";
     /// The output of the mean open direction: a unit vector.
     pub const BENT_NORMAL: &str = "bent_normal";
+    /// The output of the coefficients' standard error: 1 number.
+    pub const ERROR: &str = "error";
 }
 
 impl Default for ShOcclusion {

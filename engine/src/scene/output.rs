@@ -30,6 +30,7 @@ impl ShaderKind {
                 (ShOcclusion::COEFFICIENTS, (shader.bands * shader.bands) as usize),
                 (ShOcclusion::AMBIENT_OCCLUSION, 1),
                 (ShOcclusion::BENT_NORMAL, 3),
+                (ShOcclusion::ERROR, 1),
             ]),
         }
     }

@@ -16,8 +16,7 @@ pub(super) const TYPES: [(&str, bool); 6] = [
 ];
 
 /// The parameters of `sh_occlusion`.
-pub(super) const SH_OCCLUSION: [&str; 7] =
-    ["bands", "samples", "domain", "weight", "maxdistance", "storage", "error"];
+pub(super) const SH_OCCLUSION: [&str; 6] = ["bands", "samples", "domain", "weight", "maxdistance", "storage"];
 
 /// `<shader name="" type=""> <param name="" value=""/>... </shader>`
 pub(super) fn shader<'d>(element: Element<'d>, names: &mut Names<'d>) -> Result<Shader> {
@@ -62,11 +61,6 @@ fn set(shader: &mut ShOcclusion, name: &Value<'_>, value: &Value<'_>) -> Result<
         "storage" => {
             let types = [("f32", ValueType::F32), ("f16", ValueType::F16)];
             shader.storage = value.choice("storage", &types)?;
-        }
-        "error" => {
-            if value.flag()? {
-                return Err(value.error(ErrorKind::Unsupported, "error estimates are not supported yet"));
-            }
         }
         _ => return Err(name.unknown("parameter", SH_OCCLUSION)),
     }

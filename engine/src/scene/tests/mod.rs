@@ -20,7 +20,6 @@ const SCENE: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
       <param name="bands" value="4"/> <param name="samples" value="1024"/>
       <param name="domain" value="sphere"/> <param name="weight" value="cosine"/>
       <param name="maxdistance" value="12.5"/> <param name="storage" value="f16"/>
-      <param name="error" value="false"/>
     </shader>
     <shader name="plain" type="sh_occlusion"/>
   </shaders>
@@ -31,6 +30,7 @@ const SCENE: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
       <bakeset name="trees" occluders="trees ground">
         <attribute name="sh" shader="occlusion"/>
         <attribute name="shadow" shader="plain"/> <attribute name="ao" shader="occlusion" output="ambient_occlusion"/>
+        <attribute name="noise" shader="occlusion" output="error"/>
       </bakeset>
     </geometry>
     <geometry name="ground" occluder="true">
@@ -96,6 +96,7 @@ fn a_whole_scene_is_read() {
                         attribute("sh", "occlusion", "coefficients"),
                         attribute("shadow", "plain", "coefficients"),
                         attribute("ao", "occlusion", "ambient_occlusion"),
+                        attribute("noise", "occlusion", "error"),
                     ],
                 }],
             },
