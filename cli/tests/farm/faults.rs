@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use crate::processes::Farm;
 use crate::proxy::{Fault, Proxy, Rule};
 
-/// Kills a worker while the request that `rule` is about is held; another one ends the job.
-fn killed_at(rule: Rule) {
+/// Kills a worker while the request that the last of `rules` is about is held; another one ends the job.
+fn killed_at(rules: &[Rule]) {
     let mut farm = Farm::start();
     let proxy = Proxy::start(farm.port, None);
-    proxy.set(&[rule]);
+    proxy.set(rules);
     let job = farm.submit(1);
     let victim = farm.worker_at("victim", &format!("http://127.0.0.1:{}", proxy.port), &[]);
     proxy.held();
@@ -23,7 +23,7 @@ fn killed_at(rule: Rule) {
 /// Catches a batch that is lost when its worker dies with the part that it was about to put.
 #[test]
 fn a_worker_dies_before_it_puts() {
-    killed_at(Rule::new("PUT /v1/leases/", ".part", Fault::Hold, 1));
+    killed_at(&[Rule::new("PUT /v1/leases/", ".part", Fault::Hold, 1)]);
 }
 
 /// Catches a part that counts because it lies in storage though nobody reported it.
@@ -31,16 +31,7 @@ fn a_worker_dies_before_it_puts() {
 fn a_worker_dies_between_putting_and_reporting() {
     // Import, plan and build report first
     let passes = Rule::new("POST /v1/leases/", "/complete", Fault::Dawdle, 3);
-    let mut farm = Farm::start();
-    let proxy = Proxy::start(farm.port, None);
-    proxy.set(&[passes, Rule::new("POST /v1/leases/", "/complete", Fault::Hold, 1)]);
-    let job = farm.submit(1);
-    let victim = farm.worker_at("victim", &format!("http://127.0.0.1:{}", proxy.port), &[]);
-    proxy.held();
-    farm.kill(victim);
-    farm.worker("other");
-    farm.wait(&job);
-    farm.expect_same(&job);
+    killed_at(&[passes, Rule::new("POST /v1/leases/", "/complete", Fault::Hold, 1)]);
 }
 
 /// Catches a batch that is done twice, or not at all, because its worker died before it heard that it counted; and one

@@ -53,46 +53,31 @@ pub trait MicrogridStream: Send {
     }
 }
 
-impl<S: MicrogridStream + ?Sized> MicrogridStream for &mut S {
-    fn schema(&self) -> &Schema {
-        (**self).schema()
-    }
+/// What points to a stream is one.
+macro_rules! stream_through {
+    ($($pointer:ty),*) => {$(
+        impl<S: MicrogridStream + ?Sized> MicrogridStream for $pointer {
+            fn schema(&self) -> &Schema {
+                (**self).schema()
+            }
 
-    fn rewind(&mut self) -> Result<()> {
-        (**self).rewind()
-    }
+            fn rewind(&mut self) -> Result<()> {
+                (**self).rewind()
+            }
 
-    fn next(&mut self, grid: &mut Microgrid) -> Result<bool> {
-        (**self).next(grid)
-    }
+            fn next(&mut self, grid: &mut Microgrid) -> Result<bool> {
+                (**self).next(grid)
+            }
 
-    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
-        (**self).next_piece()
-    }
+            fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
+                (**self).next_piece()
+            }
 
-    fn progress(&self) -> f64 {
-        (**self).progress()
-    }
+            fn progress(&self) -> f64 {
+                (**self).progress()
+            }
+        }
+    )*};
 }
 
-impl<S: MicrogridStream + ?Sized> MicrogridStream for Box<S> {
-    fn schema(&self) -> &Schema {
-        (**self).schema()
-    }
-
-    fn rewind(&mut self) -> Result<()> {
-        (**self).rewind()
-    }
-
-    fn next(&mut self, grid: &mut Microgrid) -> Result<bool> {
-        (**self).next(grid)
-    }
-
-    fn next_piece(&mut self) -> Result<Option<Box<dyn Piece>>> {
-        (**self).next_piece()
-    }
-
-    fn progress(&self) -> f64 {
-        (**self).progress()
-    }
-}
+stream_through!(&mut S, Box<S>);
