@@ -1,5 +1,9 @@
 //! Submissions: a request becomes one job, or one for each frame; its scene is in storage before the job is in the queue.
 
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use futures_util::stream::{self, StreamExt, TryStreamExt};
 use protocol::job::{JobRequest, ResubmitRequest, Submitted};
 use protocol::keys;
 
@@ -18,6 +22,8 @@ pub struct Submitter<'a> {
     pub key: Option<&'a str>,
 }
 
+/// Scenes that are put into storage at once.
+const SCENES_AT_ONCE: usize = 32;
 /// Bytes of an `Idempotency-Key` at most.
 const KEY_BYTES_MAX: usize = 255;
 
@@ -69,9 +75,10 @@ impl Coordinator {
             return Ok(Submitted { jobs, repeated: true });
         }
         let frames = self.check(request).await?;
+        let without_scene = Arc::new(JobRequest { scene: String::new(), ..request.clone() });
         let new = |frame: &Option<i64>| NewJob {
             id: random::id(self.now()),
-            request: request.clone(),
+            request: without_scene.clone(),
             request_sha256: request_sha256.clone(),
             idempotency_key: submitter.key.map(str::to_owned),
             frame: *frame,
@@ -81,13 +88,18 @@ impl Coordinator {
         let mut jobs: Vec<NewJob> = frames.iter().map(new).collect();
         jobs.sort_by(|a, b| a.id.cmp(&b.id));
         jobs.iter_mut().zip(frames).for_each(|(job, frame)| job.frame = frame);
-        self.store_and_queue(&jobs, request).await
+        self.store_and_queue(&jobs, &request.scene).await
     }
 
-    async fn store_and_queue(&self, jobs: &[NewJob], request: &JobRequest) -> Result<Submitted> {
-        for job in jobs {
-            self.storage.put(&keys::scene(&job.id), request.scene.clone()).await?;
-        }
+    async fn store_and_queue(&self, jobs: &[NewJob], scene: &str) -> Result<Submitted> {
+        let scene = Bytes::copy_from_slice(scene.as_bytes());
+        let put = |job: &NewJob| {
+            let (key, scene) = (keys::scene(&job.id), scene.clone());
+            async move { self.storage.put(&key, scene).await }
+        };
+        // A disk is told to keep many files sooner at once than one after the other
+        let puts = stream::iter(jobs.iter().map(put)).buffer_unordered(SCENES_AT_ONCE);
+        puts.try_collect::<()>().await?;
         let made = self.store.submit(jobs, self.now()).await;
         let repeated = made.as_ref().is_ok_and(|made| made.first() != jobs.first().map(|job| &job.id));
         if repeated || made.as_ref().is_err_and(|error| error.kind != Kind::Unavailable) {

@@ -71,7 +71,7 @@ impl Store {
         let mut tx = self.begin().await?;
 
         // Lock the segment, or leave it to whoever has it; a process whose name another has taken gets nothing
-        let sql = "SELECT p.job_id, j.started_at FROM segment s JOIN pass p ON p.id = s.pass_id JOIN job j ON j.id = p.job_id
+        let sql = "SELECT p.job_id, j.started_at, s.lo, s.hi FROM segment s JOIN pass p ON p.id = s.pass_id JOIN job j ON j.id = p.job_id
             WHERE s.pass_id = $1 AND s.seg = $2 AND s.n_ready > 0 AND p.state = $3 AND j.paused = 0
                 AND NOT EXISTS (SELECT 1 FROM worker w WHERE w.name = $4 AND w.session <> $5)
                 AND NOT EXISTS (SELECT 1 FROM worker_block k WHERE k.worker = $4 AND k.job_id = j.id AND k.n >= $6)";
@@ -86,6 +86,7 @@ impl Store {
             return Ok(if is_busy { Taken::Busy } else { Taken::Empty });
         };
         let (job, first_of_job) = (row.text(0)?, row.int_or_null(1)?.is_none());
+        let (lo, hi) = (row.int(2)?, row.int(3)?);
 
         // Take what this worker has not failed at, or what as many have failed at as there are
         let not_mine = match claimer.alive {
@@ -100,13 +101,13 @@ impl Store {
         let order = if from_tail { "DESC" } else { "ASC" };
         let sql = format!(
             "UPDATE batch SET state = 1, fence = fence + 1, lease_id = $5 WHERE pass_id = $1 AND state = 0 AND seq IN (
-                SELECT b.seq FROM batch b WHERE b.pass_id = $1 AND b.seg = $2 AND b.state = 0
+                SELECT b.seq FROM batch b WHERE b.pass_id = $1 AND b.seq >= $2 AND b.seq < $8 AND b.state = 0
                     AND b.not_before <= $3 AND b.memory_min <= $4 {not_mine} ORDER BY b.seq {order} LIMIT $7)
             RETURNING seq, fence"
         );
         let lease = crate::random::id(now);
         let memory = claimer.memory_bytes;
-        let values = values![pass, segment, now, memory, &lease, claimer.worker, count];
+        let values = values![pass, lo, now, memory, &lease, claimer.worker, count, hi];
         let rows = tx.query(sql.into(), values).await?;
         let batch = |row: &super::Row| Ok(ClaimedBatch { batch: row.int(0)?, fence: row.int(1)? });
         let mut batches = rows.iter().map(batch).collect::<Result<Vec<_>>>()?;

@@ -49,15 +49,16 @@ impl Store {
     /// # Errors
     /// When the database refuses.
     pub async fn sweep_cancelled(&self) -> Result<bool> {
-        let sql = "SELECT s.pass_id, s.seg FROM pass p JOIN segment s ON s.pass_id = p.id
+        let sql = "SELECT s.pass_id, s.seg, s.lo, s.hi FROM segment s JOIN pass p ON p.id = s.pass_id
             WHERE p.state = $1 AND s.n_ready > 0 ORDER BY s.pass_id, s.seg LIMIT 8";
         let segments = self.query(sql, values![PassState::Cancelled.code()]).await?;
         let mut swept = 0;
         for row in &segments {
             let (pass, segment) = (row.int(0)?, row.int(1)?);
             let mut tx = self.begin().await?;
-            let sql = "UPDATE batch SET state = 5 WHERE pass_id = $1 AND seg = $2 AND state = 0";
-            let count = tx.execute(sql.into(), values![pass, segment]).await? as i64;
+            let sql =
+                "UPDATE batch SET state = 5 WHERE pass_id = $1 AND seq >= $2 AND seq < $3 AND state = 0";
+            let count = tx.execute(sql.into(), values![pass, row.int(2)?, row.int(3)?]).await? as i64;
             let sql = "UPDATE segment SET n_ready = n_ready - $3, n_skipped = n_skipped + $3 WHERE pass_id = $1 AND seg = $2";
             tx.execute(sql.into(), values![pass, segment, count]).await?;
             self.commit("sweep", tx).await?;

@@ -53,7 +53,7 @@ impl Store {
 
     async fn load_jobs(&self, farm: &mut Farm) -> Result<()> {
         let sql = "SELECT p.id, j.id, j.project, j.priority, j.paused, j.running_max, j.request
-            FROM pass p JOIN job j ON j.id = p.job_id WHERE p.state = $1 ORDER BY p.id";
+            FROM pass p JOIN job j ON j.id = p.job_id WHERE p.state = $1 AND p.state <= 2 ORDER BY p.id";
         for row in self.query(sql, values![PassState::Open.code()]).await? {
             let (pass, id) = (row.int(0)?, row.text(1)?);
             farm.passes.insert(pass, Pass { job: id.clone(), segments: BTreeMap::new() });
@@ -80,7 +80,7 @@ impl Store {
     async fn load_segments(&self, farm: &mut Farm) -> Result<()> {
         let sql =
             "SELECT s.pass_id, s.seg, s.n_ready, s.n_leased, s.owner, s.owner_until, s.ewma_ms, s.not_before
-            FROM pass p JOIN segment s ON s.pass_id = p.id WHERE p.state = $1 AND s.n_ready + s.n_leased > 0";
+            FROM pass p JOIN segment s ON s.pass_id = p.id WHERE p.state = $1 AND p.state <= 2 AND s.n_ready + s.n_leased > 0";
         for row in self.query(sql, values![PassState::Open.code()]).await? {
             let Some(pass) = farm.passes.get_mut(&row.int(0)?) else { continue };
             if let Some(job) = farm.jobs.get_mut(&pass.job) {

@@ -237,7 +237,7 @@ impl Store {
         if builder != Some(build.id) {
             return Ok(());
         }
-        let sql = "SELECT id, job_id FROM pass WHERE kind = $1 AND name = $2 AND state = $3 ORDER BY id";
+        let sql = "SELECT id, job_id FROM pass WHERE kind = $1 AND name = $2 AND state = $3 AND state <= 2 ORDER BY id";
         let values = values![PassKind::Build.code(), &build.name, PassState::Waiting.code()];
         let waiting = tx.query(sql.into(), values).await?;
         if state == PassState::Done {
@@ -292,7 +292,7 @@ impl Store {
     /// # Errors
     /// When the database refuses.
     pub async fn create_some(&self) -> Result<Option<String>> {
-        let sql = "SELECT id, job_id FROM pass WHERE state = 0 ORDER BY id LIMIT 1";
+        let sql = "SELECT id, job_id FROM pass WHERE state = 0 AND state <= 2 ORDER BY id LIMIT 1";
         let Some(row) = self.query_one(sql, vec![]).await? else { return Ok(None) };
         let (pass, job) = (row.int(0)?, row.text(1)?);
         let mut tx = self.begin().await?;

@@ -1,5 +1,7 @@
 //! Submissions: a job is in the database before its submitter hears of it.
 
+use std::sync::Arc;
+
 use protocol::JobState;
 use protocol::job::JobRequest;
 
@@ -13,8 +15,8 @@ use crate::{Error, Result, values};
 pub struct NewJob {
     /// Its id.
     pub id: String,
-    /// What was asked for; the scene is in storage.
-    pub request: JobRequest,
+    /// What was asked for, without the scene, which is in storage; the frames of a submission share it.
+    pub request: Arc<JobRequest>,
     /// A hash of the request as it came.
     pub request_sha256: String,
     /// The key under which the same request is not carried out twice.
@@ -92,7 +94,6 @@ impl Store {
         let shot = shot.trim_matches('/');
         let state = if blocked { JobState::Blocked } else { JobState::Ready };
         let reason = if blocked { "another job must succeed before" } else { "" };
-        let without_scene = JobRequest { scene: String::new(), ..request.clone() };
         let sql = "INSERT INTO job (id, project, name, state, paused, reason, priority, running_max, failed_max,
                 partial, request, request_sha256, idempotency_key, shot, comment, frame, submitted_by, resubmit_of, created_at)
             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16, $17, $18, $19)";
@@ -109,7 +110,7 @@ impl Store {
                 request.running_max,
                 request.failed_max,
                 request.partial,
-                serde_json::to_string(&without_scene)?,
+                serde_json::to_string(&**request)?,
                 &job.request_sha256,
                 job.idempotency_key.clone(),
                 shot,

@@ -152,7 +152,7 @@ impl Store {
     /// When the database refuses.
     pub async fn done_of_live_jobs(&self, now: i64) -> Result<Vec<(String, PaceSample)>> {
         let sql = "SELECT p.job_id, CAST(SUM(s.n_done) AS BIGINT) FROM pass p JOIN segment s ON s.pass_id = p.id
-            WHERE p.kind = $1 AND p.job_id IN (SELECT job_id FROM pass WHERE state = $2 AND kind = $1) GROUP BY p.job_id";
+            WHERE p.kind = $1 AND p.job_id IN (SELECT job_id FROM pass WHERE state = $2 AND state <= 2 AND kind = $1) GROUP BY p.job_id";
         let rows = self.query(sql, values![PassKind::Bake.code(), PassState::Open.code()]).await?;
         rows.iter().map(|row| Ok((row.text(0)?, PaceSample { at: now, done: row.int(1)? }))).collect()
     }

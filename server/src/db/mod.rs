@@ -17,6 +17,8 @@ pub mod job;
 pub mod lease;
 pub mod list;
 mod migrate;
+#[cfg(test)]
+mod plans;
 pub mod postgres;
 pub mod sqlite;
 pub mod truth;

@@ -5,10 +5,13 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use sqlx::postgres::{PgArguments, PgConnectOptions, PgPool, PgPoolOptions, PgRow};
-use sqlx::{AssertSqlSafe, Column, Postgres, Row as _, TypeInfo};
+use sqlx::{AssertSqlSafe, Column, Connection, Postgres, Row as _, TypeInfo};
 
 use super::driver::{Dialect, Driver, Row, Sql, Transaction, Value};
 use crate::Result;
+
+/// A connection that has rested for so long is asked whether it is still there before it is used.
+const RESTED: Duration = Duration::from_secs(1);
 
 /// A PostgreSQL database.
 pub struct PostgresDriver {
@@ -25,7 +28,19 @@ impl PostgresDriver {
             .application_name("pantaray")
             .options([("idle_in_transaction_session_timeout", "30s"), ("statement_timeout", "60s")])
             .statement_cache_capacity(256);
-        let pool = PgPoolOptions::new().max_connections(connections).acquire_timeout(Duration::from_secs(10));
+        // One that was used a moment ago is not asked whether it is still there
+        let pool = PgPoolOptions::new()
+            .max_connections(connections)
+            .acquire_timeout(Duration::from_secs(10))
+            .test_before_acquire(false)
+            .before_acquire(|connection, known| {
+                Box::pin(async move {
+                    if known.idle_for >= RESTED {
+                        connection.ping().await?;
+                    }
+                    Ok(true)
+                })
+            });
         Ok(Self { pool: pool.connect_with(options).await? })
     }
 }

@@ -6,24 +6,28 @@
 use std::fs::{File, TryLockError};
 use std::path::Path;
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use sqlx::sqlite::{
-    SqliteArguments, SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow,
-    SqliteSynchronous,
+    SqliteArguments, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool,
+    SqlitePoolOptions, SqliteRow, SqliteSynchronous,
 };
-use sqlx::{AssertSqlSafe, Row as _, Sqlite, TypeInfo, ValueRef};
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Row as _, Sqlite, TypeInfo, ValueRef};
+use tokio::sync::{Mutex, OwnedMutexGuard};
 
 use super::driver::{Dialect, Driver, Row, Sql, Transaction, Value};
 use crate::error::Kind;
 use crate::{Error, Result};
 
 const READERS: u32 = 4;
+/// How long a transaction waits for its turn, and a query for a connection.
+const TURN: Duration = Duration::from_secs(30);
 
 /// A SQLite file.
 pub struct SqliteDriver {
-    writer: SqlitePool,
+    writer: Arc<Mutex<Writer>>,
     readers: SqlitePool,
     /// Forbids a second coordinator on the same file.
     _lock: File,
@@ -58,12 +62,48 @@ impl SqliteDriver {
             .pragma("wal_autocheckpoint", "4000")
             .pragma("journal_size_limit", "268435456")
             .statement_cache_capacity(256);
-        let writer = SqlitePoolOptions::new().max_connections(1).acquire_timeout(Duration::from_secs(30));
-        let writer = writer.connect_with(options.clone()).await?;
-        let readers =
-            SqlitePoolOptions::new().max_connections(READERS).acquire_timeout(Duration::from_secs(30));
-        let readers = readers.connect_with(options.read_only(true)).await?;
-        Ok(Self { writer, readers, _lock: lock })
+        let writer = Writer { connection: Some(options.connect().await?), is_open: false };
+        // A file's connections do not break: nobody needs to ask them
+        let readers = SqlitePoolOptions::new().max_connections(READERS).acquire_timeout(TURN);
+        let readers = readers.test_before_acquire(false).connect_with(options.read_only(true)).await?;
+        Ok(Self { writer: Arc::new(Mutex::new(writer)), readers, _lock: lock })
+    }
+
+    /// The connection that writes, when it is our turn.
+    async fn turn(&self) -> Result<OwnedMutexGuard<Writer>> {
+        let turn = tokio::time::timeout(TURN, self.writer.clone().lock_owned()).await;
+        Ok(turn.map_err(|_| sqlx::Error::PoolTimedOut)?)
+    }
+}
+
+/// The one connection that writes. A pool would ask before and after each transaction whether it is still there.
+struct Writer {
+    /// None when all is over.
+    connection: Option<SqliteConnection>,
+    /// Whether a transaction was begun and has not ended, as far as we have heard.
+    is_open: bool,
+}
+
+impl Writer {
+    fn connection(&mut self) -> Result<&mut SqliteConnection> {
+        Ok(self.connection.as_mut().ok_or(sqlx::Error::PoolClosed)?)
+    }
+
+    /// Begins a transaction, after whatever was left open by somebody who has gone.
+    async fn begin(&mut self) -> Result<()> {
+        if self.is_open {
+            let ended = self.end("ROLLBACK").await;
+            ended.unwrap_or_else(|error| tracing::debug!(%error, "nothing was left open"));
+        }
+        self.is_open = true;
+        sqlx::query("BEGIN IMMEDIATE").execute(self.connection()?).await?;
+        Ok(())
+    }
+
+    async fn end(&mut self, how: &'static str) -> Result<()> {
+        sqlx::query(how).execute(self.connection()?).await?;
+        self.is_open = false;
+        Ok(())
     }
 }
 
@@ -100,7 +140,9 @@ impl Driver for SqliteDriver {
     }
 
     async fn begin(&self) -> Result<Box<dyn Transaction>> {
-        Ok(Box::new(SqliteTransaction(self.writer.begin_with("BEGIN IMMEDIATE").await?)))
+        let mut writer = self.turn().await?;
+        writer.begin().await?;
+        Ok(Box::new(SqliteTransaction(writer)))
     }
 
     async fn query(&self, sql: Sql, values: Vec<Value>) -> Result<Vec<Row>> {
@@ -109,7 +151,7 @@ impl Driver for SqliteDriver {
     }
 
     async fn script(&self, sql: &'static str) -> Result<()> {
-        sqlx::raw_sql(sql).execute(&self.writer).await?;
+        sqlx::raw_sql(sql).execute(self.turn().await?.connection()?).await?;
         Ok(())
     }
 
@@ -119,29 +161,34 @@ impl Driver for SqliteDriver {
 
     async fn close(&self) {
         self.readers.close().await;
-        self.writer.close().await;
+        if let Some(connection) = self.writer.lock().await.connection.take()
+            && let Err(error) = connection.close().await
+        {
+            tracing::warn!(%error, "the database was not closed properly");
+        }
     }
 }
 
-struct SqliteTransaction(sqlx::Transaction<'static, Sqlite>);
+/// What the connection that writes does for somebody; undone, when dropped, before anything else is begun.
+struct SqliteTransaction(OwnedMutexGuard<Writer>);
 
 #[async_trait]
 impl Transaction for SqliteTransaction {
     async fn execute(&mut self, sql: Sql, values: Vec<Value>) -> Result<u64> {
         let query = sqlx::query_with::<Sqlite, _>(AssertSqlSafe(sql), arguments(values)?);
-        Ok(query.execute(&mut *self.0).await?.rows_affected())
+        Ok(query.execute(self.0.connection()?).await?.rows_affected())
     }
 
     async fn query(&mut self, sql: Sql, values: Vec<Value>) -> Result<Vec<Row>> {
         let query = sqlx::query_with::<Sqlite, _>(AssertSqlSafe(sql), arguments(values)?);
-        query.fetch_all(&mut *self.0).await?.iter().map(row).collect()
+        query.fetch_all(self.0.connection()?).await?.iter().map(row).collect()
     }
 
-    async fn commit(self: Box<Self>) -> Result<()> {
-        Ok(self.0.commit().await?)
+    async fn commit(mut self: Box<Self>) -> Result<()> {
+        self.0.end("COMMIT").await
     }
 
-    async fn rollback(self: Box<Self>) -> Result<()> {
-        Ok(self.0.rollback().await?)
+    async fn rollback(mut self: Box<Self>) -> Result<()> {
+        self.0.end("ROLLBACK").await
     }
 }

@@ -1,5 +1,7 @@
 //! A job's way from submission to publication.
 
+use std::sync::Arc;
+
 use protocol::work::PassResult;
 use protocol::{JobState, PassKind, PassState};
 use server::db::list::JobList;
@@ -105,7 +107,7 @@ async fn the_same_request_makes_one_job(queue: Queue) {
 async fn dependencies_hold_jobs_back(queue: Queue) {
     queue.submit("a").await;
     let mut job = new_job("b", None);
-    job.request.depends_on = vec!["a".into()];
+    Arc::make_mut(&mut job.request).depends_on = vec!["a".into()];
     queue.store.submit(&[job.clone()], queue.now).await.unwrap();
     queue.advance("b").await;
     assert_eq!(queue.store.pass_details("b").await.unwrap().len(), 0);
@@ -120,7 +122,7 @@ async fn dependencies_hold_jobs_back(queue: Queue) {
     queue.advance("b").await;
     assert_eq!(queue.store.pass_details("b").await.unwrap().len(), 1);
     job.id = "c".into();
-    job.request.depends_on = vec!["nowhere".into()];
+    Arc::make_mut(&mut job.request).depends_on = vec!["nowhere".into()];
     assert!(queue.store.submit(&[job], queue.now).await.is_err());
 }
 

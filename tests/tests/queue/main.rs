@@ -7,6 +7,8 @@ mod graph;
 mod model;
 mod people;
 
+use std::sync::Arc;
+
 use protocol::job::JobRequest;
 use protocol::work::{CompleteItem, Outcome, PassResult, RegisterRequest, SetMap, Verdict};
 use protocol::{FailureClass, PassKind};
@@ -200,7 +202,7 @@ pub(crate) fn new_job(id: &str, key: Option<&str>) -> NewJob {
             .expect("a request");
     NewJob {
         id: id.into(),
-        request,
+        request: Arc::new(request),
         request_sha256: "hash".into(),
         idempotency_key: key.map(Into::into),
         frame: None,
