@@ -59,6 +59,16 @@ impl Crew {
         Ok(crew)
     }
 
+    /// Workers of this crew.
+    pub fn len(&self) -> usize {
+        self.threads.len()
+    }
+
+    /// Whether nobody is in it.
+    pub fn is_empty(&self) -> bool {
+        self.threads.is_empty()
+    }
+
     /// Lets the workers go: they end what they are at, and ask for no more.
     pub fn dismiss(&self) {
         self.leave.store(true, Ordering::Relaxed);

@@ -182,6 +182,17 @@ impl Stage {
         jobs.iter().try_for_each(|job| Ok(self.client().act(&job.id, "resume").map(drop)?))
     }
 
+    /// Waits until all who are hired are known to a coordinator.
+    ///
+    /// # Errors
+    /// When it takes longer than `patience`.
+    pub fn until_known(&self, patience: Duration) -> Result<()> {
+        let hired: usize = self.crews.iter().map(Crew::len).sum();
+        self.until("all workers are known", patience, || {
+            Ok(self.shared.registered.load(Ordering::Relaxed) >= hired)
+        })
+    }
+
     /// Waits until something is so.
     ///
     /// # Errors

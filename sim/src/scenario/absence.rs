@@ -60,9 +60,7 @@ pub fn reconnect(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
     stage.prepare(&[&job])?;
     stage.client().act(&job.id, "pause")?;
     stage.hire(&size.crew())?;
-    stage.until("all workers are known", PATIENCE, || {
-        Ok(stage.shared.registered.load(Ordering::Relaxed) == size.workers)
-    })?;
+    stage.until_known(PATIENCE)?;
     // The coordinator looks at the farm once a second: each worker is to get its one batch
     std::thread::sleep(Duration::from_secs(2));
     stage.client().act(&job.id, "resume")?;

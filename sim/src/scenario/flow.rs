@@ -20,9 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(90);
 /// All workers wait; then there is work for all.
 pub fn fill(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
     stage.hire(&size.crew())?;
-    stage.until("all workers are known", PATIENCE, || {
-        Ok(stage.shared.registered.load(Ordering::Relaxed) == size.workers)
-    })?;
+    stage.until_known(PATIENCE)?;
     std::thread::sleep(Duration::from_secs(1));
     let gate = Arc::new(Gate::default());
     let load = Load { gate: Some(gate), ..Load::new(size.batches(8), 0.0, 60_000) };

@@ -45,9 +45,7 @@ pub fn million(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
 
     // All workers wait for work
     stage.hire(&size.crew())?;
-    stage.until("all workers are known", PATIENCE, || {
-        Ok(stage.shared.registered.load(Ordering::Relaxed) == size.workers)
-    })?;
+    stage.until_known(PATIENCE)?;
     std::thread::sleep(Duration::from_secs(5));
     let resident = |stage: &Stage| {
         let bytes = stage.processes[0].as_ref().and_then(crate::process::Process::resident_bytes);
@@ -146,9 +144,7 @@ pub fn list(stage: &mut Stage, _: &Size) -> Result<Vec<Figure>> {
 pub fn idle(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
     let temper = Temper { wait: Duration::from_secs(25), ..Temper::default() };
     stage.hire(&vec![temper; size.workers])?;
-    stage.until("all workers are known", PATIENCE, || {
-        Ok(stage.shared.registered.load(Ordering::Relaxed) == size.workers)
-    })?;
+    stage.until_known(PATIENCE)?;
     std::thread::sleep(Duration::from_secs(10));
     let operations = || {
         let all = stage.metrics();
