@@ -6,6 +6,7 @@ use glam::IVec3;
 
 use super::lines::{LINES_MAX, Lines};
 use super::shapes::{BLOCK, Shape, TRIANGLES};
+use crate::brick::LatticeBox;
 use crate::brick::node::{Node, WIDTH};
 
 /// Boxes of a node's children relative to the lines' center, in lattice steps.
@@ -16,6 +17,21 @@ pub struct Boxes {
     pub center: [[f32; WIDTH]; 3],
     /// Half extents, padded against rounding, per axis.
     pub half: [[f32; WIDTH]; 3],
+}
+
+impl Boxes {
+    /// Puts a box into a slot.
+    #[inline(always)]
+    pub fn put(&mut self, slot: usize, bounds: &LatticeBox, lines: &Lines<'_>) {
+        for axis in 0..3 {
+            let low = bounds.min[axis].wrapping_sub(lines.center[axis]) as f32;
+            let high = bounds.max[axis].wrapping_sub(lines.center[axis]) as f32;
+            let (center, half) = ((low + high) * 0.5, (high - low) * 0.5);
+            let reach = lines.half[axis] + lines.half[axis];
+            self.center[axis][slot] = center;
+            self.half[axis][slot] = ((center.abs() + half) + reach).mul_add(BOX_ERROR, half);
+        }
+    }
 }
 
 /// Relative error of box arithmetic: a few roundings of 2^-24.
