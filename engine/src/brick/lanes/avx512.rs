@@ -393,17 +393,9 @@ unsafe fn tile_faces(columns: usize) -> __m512i {
     // SAFETY: no memory is touched
     unsafe {
         let face = _mm512_set_epi32(7, 6, 5, 4, 3, 2, 1, 0, 7, 6, 5, 4, 3, 2, 1, 0);
-        _mm512_add_epi32(face, quotient(face, columns))
-    }
-}
-
-/// Whole parts for numbers up to 16 by one of up to 16, by multiplication.
-#[inline(always)]
-unsafe fn quotient(numbers: __m512i, by: usize) -> __m512i {
-    // SAFETY: no memory is touched
-    unsafe {
-        let inverse = _mm512_set1_epi32(256 / by as i32 + 1);
-        _mm512_srli_epi32::<8>(_mm512_mullo_epi32(numbers, inverse))
+        // face / columns for up to 8 of each, by multiplication
+        let inverse = _mm512_set1_epi32(256 / columns as i32 + 1);
+        _mm512_add_epi32(face, _mm512_srli_epi32::<8>(_mm512_mullo_epi32(face, inverse)))
     }
 }
 
@@ -432,32 +424,18 @@ struct PredictedTile {
 impl PredictedTile {
     #[inline(always)]
     unsafe fn of(layout: &Layout) -> Self {
-        let corners = predict::corners(layout.stride, layout.vertices).map(|corner| corner as i32);
+        let corners = predict::corners(layout.stride, layout.vertices);
         let rows = layout.vertices / layout.stride - 1;
-        // SAFETY: no memory is touched
+        let lanes = &predict::LANES[layout.columns - 1][rows - 1];
+        // SAFETY: loads are of whole arrays
         unsafe {
-            let vertex = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
-            let one = _mm512_set1_epi32(1);
-            let (mut are_corners, mut corners_before) = (0, _mm512_setzero_si512());
-            let corners = corners.map(|corner| {
-                let lane = _mm512_set1_epi32(corner);
-                are_corners |= _mm512_cmpeq_epi32_mask(vertex, lane);
-                let is_behind = _mm512_cmpgt_epi32_mask(vertex, lane);
-                corners_before = _mm512_mask_add_epi32(corners_before, is_behind, corners_before, one);
-                lane
-            });
-            let others_before = _mm512_sub_epi32(vertex, corners_before);
-            let row = quotient(vertex, layout.stride);
-            let column =
-                _mm512_sub_epi32(vertex, _mm512_mullo_epi32(row, _mm512_set1_epi32(layout.stride as i32)));
-            let across = _mm512_mullo_epi32(column, _mm512_set1_epi32((256 / layout.columns) as i32));
-            let down = _mm512_mullo_epi32(row, _mm512_set1_epi32((256 / rows) as i32));
-            let both = _mm512_srli_epi32::<8>(_mm512_mullo_epi32(across, down));
+            let weights =
+                |kind: usize| _mm512_cvtepu16_epi32(_mm256_loadu_si256(lanes.weights[kind].as_ptr().cast()));
             Self {
-                corners,
-                are_corners,
-                place: _mm512_mask_mov_epi32(others_before, are_corners, corners_before),
-                weights: [across, down, both],
+                corners: corners.map(|corner| _mm512_set1_epi32(corner as i32)),
+                are_corners: corners.iter().fold(0, |all, &corner| all | 1 << corner),
+                place: _mm512_cvtepu8_epi32(_mm_loadu_si128(lanes.places.as_ptr().cast())),
+                weights: [weights(0), weights(1), weights(2)],
             }
         }
     }

@@ -1,26 +1,77 @@
 //! What a tile's vertices are expected to be: bilinear between its four corners, so that only what differs is stored.
 
+use super::FACES_MAX;
+
 /// Vertices of a predicted tile at most: they fill a vector.
 pub const PREDICTED_VERTICES_MAX: usize = 16;
 
 /// The corners of a tile, whose vertices are `stride` to a row: the first and the last of the first row, then of the last.
 #[inline(always)]
-pub fn corners(stride: usize, vertices: usize) -> [usize; 4] {
+pub const fn corners(stride: usize, vertices: usize) -> [usize; 4] {
     [0, stride - 1, vertices - stride, vertices - 1]
 }
 
 /// Where among the vertices that are no corners a vertex stands; none if it is a corner.
 #[inline(always)]
 pub fn place(vertex: usize, corners: [usize; 4]) -> Option<usize> {
-    let before = corners.iter().filter(|&&corner| corner < vertex).count();
-    (!corners.contains(&vertex)).then(|| vertex - before)
+    let (place, is_corner) = stands(vertex, corners);
+    (!is_corner).then_some(place)
+}
+
+/// Where a vertex stands among its like, and whether it is a corner.
+#[inline(always)]
+const fn stands(vertex: usize, corners: [usize; 4]) -> (usize, bool) {
+    let (mut before, mut is_corner, mut i) = (0, false, 0);
+    while i < 4 {
+        before += (corners[i] < vertex) as usize;
+        is_corner |= corners[i] == vertex;
+        i += 1;
+    }
+    (if is_corner { before } else { vertex - before }, is_corner)
 }
 
 /// How far a vertex lies across and down, and both multiplied, in 256ths.
 #[inline(always)]
-pub fn weights(vertex: usize, columns: usize, rows: usize) -> [i32; 3] {
+pub const fn weights(vertex: usize, columns: usize, rows: usize) -> [i32; 3] {
     let (across, down) = (vertex % (columns + 1) * (256 / columns), vertex / (columns + 1) * (256 / rows));
     [across as i32, down as i32, (across * down >> 8) as i32]
+}
+
+/// [`place`] and [`weights`] of a tile's first vertices; a corner's place is that among the corners.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+pub struct Lanes {
+    /// Places.
+    pub places: [u8; PREDICTED_VERTICES_MAX],
+    /// Weights, one kind after the other.
+    pub weights: [[u16; PREDICTED_VERTICES_MAX]; 3],
+}
+
+/// Lanes by columns - 1 and rows - 1.
+pub static LANES: [[Lanes; FACES_MAX]; FACES_MAX] = all_lanes();
+
+const fn all_lanes() -> [[Lanes; FACES_MAX]; FACES_MAX] {
+    let none = Lanes { places: [0; PREDICTED_VERTICES_MAX], weights: [[0; PREDICTED_VERTICES_MAX]; 3] };
+    let mut all = [[none; FACES_MAX]; FACES_MAX];
+    let mut shape = 0;
+    while shape < FACES_MAX * FACES_MAX {
+        let (columns, rows) = (shape / FACES_MAX + 1, shape % FACES_MAX + 1);
+        let vertices = (columns + 1) * (rows + 1);
+        let corners = corners(columns + 1, vertices);
+        let lanes = &mut all[columns - 1][rows - 1];
+        let mut vertex = 0;
+        while vertex < vertices && vertex < PREDICTED_VERTICES_MAX {
+            let (place, _) = stands(vertex, corners);
+            lanes.places[vertex] = place as u8;
+            let [across, down, both] = weights(vertex, columns, rows);
+            lanes.weights[0][vertex] = across as u16;
+            lanes.weights[1][vertex] = down as u16;
+            lanes.weights[2][vertex] = both as u16;
+            vertex += 1;
+        }
+        shape += 1;
+    }
+    all
 }
 
 /// A coordinate by those of the corners. It wraps around, everywhere in the same way.

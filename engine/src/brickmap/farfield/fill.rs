@@ -98,7 +98,8 @@ pub unsafe fn fill<K: Kernel>(
     // A loop, since an iterator's would not have the instruction set
     let mut leaf_moments = Vec::with_capacity(shapes.len());
     for leaf in 0..shapes.len() as u32 {
-        leaf_moments.push(Moments::of(shapes, shapes.shape(leaf)));
+        // SAFETY: the caller's
+        leaf_moments.push(unsafe { Moments::of::<K>(shapes, shapes.shape(leaf)) });
     }
     let mut filler = Filler {
         grove,

@@ -59,6 +59,17 @@ pub trait Kernel {
         out: &mut [u64; WIDTH],
     );
 
+    /// The corners of a leaf's triangles relative to `reference`: corner, axis, lane. Lanes without a triangle have no meaning.
+    ///
+    /// # Safety
+    /// See the trait.
+    unsafe fn corners(
+        shape: &Shape,
+        blocks: [&[[i32; BLOCK]; 3]; 2],
+        reference: [i32; 3],
+        out: &mut [[[f32; TRIANGLES]; 3]; 3],
+    );
+
     /// The lines of `mask` that meet a triangle of the leaf, and for each of these which triangles, one bit a lane.
     ///
     /// # Safety
@@ -87,6 +98,24 @@ fn max(a: f32, b: f32) -> f32 {
 }
 
 impl Kernel for Plain {
+    #[inline(always)]
+    unsafe fn corners(
+        shape: &Shape,
+        blocks: [&[[i32; BLOCK]; 3]; 2],
+        reference: [i32; 3],
+        out: &mut [[[f32; TRIANGLES]; 3]; 3],
+    ) {
+        for corner in 0..3 {
+            for axis in 0..3 {
+                for lane in 0..TRIANGLES {
+                    let vertex = usize::from(shape.corners[corner][lane]);
+                    let position = blocks[vertex / BLOCK % 2][axis][vertex % BLOCK];
+                    out[corner][axis][lane] = position.wrapping_sub(reference[axis]) as f32;
+                }
+            }
+        }
+    }
+
     #[inline(always)]
     unsafe fn boxes(node: &Node, lines: &Lines<'_>, out: &mut Boxes) {
         for axis in 0..3 {
