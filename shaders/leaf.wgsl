@@ -11,13 +11,21 @@ struct Leaf {
     word: u32,
     kind: u32,
     faces: u32,
+    vertices: u32,
     // Quads across a tile
     columns: u32,
+    // Vertices from one row of quads to the next; 0 where faces have an index for every corner
+    stride: u32,
     bits: vec3<u32>,
+    // Of what is stored between the corners of a predicted tile
+    is_predicted: bool,
+    rest_bits: vec3<u32>,
     shift: u32,
     is_opaque: bool,
     // What packed coordinates are relative to
     origin: vec3<i32>,
+    // Byte offset
+    indices: u32,
     index_bits: u32,
     index_bytes: u32,
     // Byte offsets
@@ -34,34 +42,56 @@ fn read_leaf(line: u32, slot: u32) -> Leaf {
     let first = (header & 7u) + 1u;
     let second = ((header >> 3u) & 31u) + 1u;
     leaf.faces = first;
+    leaf.vertices = second;
     leaf.columns = 0u;
-    var vertices = second;
+    leaf.stride = 0u;
+    leaf.is_predicted = false;
+    leaf.rest_bits = vec3<u32>(0u);
+    leaf.indices = LEAF_HEADER_BYTES;
     var columns_of_indices = 4u;
+    let variant = (header >> 31u) != 0u;
+    let more = word(leaf.word + 1u);
     switch leaf.kind {
         case LEAF_TILE: {
             leaf.faces = first * second;
             leaf.columns = second;
-            vertices = (first + 1u) * (second + 1u);
+            leaf.stride = second + 1u;
+            leaf.vertices = (first + 1u) * leaf.stride;
             columns_of_indices = 0u;
+            if variant {
+                leaf.is_predicted = true;
+                leaf.rest_bits = vec3<u32>(more & 31u, (more >> 5u) & 31u, (more >> 10u) & 31u);
+                leaf.indices += 2u;
+            }
         }
         case LEAF_TRIANGLES: {
-            leaf.faces = first + 8u * (header >> 31u);
+            leaf.faces = first + select(0u, 8u, variant);
             columns_of_indices = 3u;
         }
         case LEAF_ROUND: {
             columns_of_indices = 2u;
         }
-        default: {}
+        default: {
+            if variant {
+                leaf.stride = more & 255u;
+                columns_of_indices = 1u;
+                leaf.indices += 1u;
+            }
+        }
     }
     leaf.shift = (header >> 8u) & 31u;
     leaf.bits = vec3<u32>((header >> 13u) & 31u, (header >> 18u) & 31u, (header >> 23u) & 31u);
     leaf.is_opaque = ((header >> 30u) & 1u) == 0u;
     let shifts = vec3<u32>(leaf.shift);
     leaf.origin = (lower_corner(read_boxes(line), slot) >> shifts) << shifts;
-    leaf.index_bits = select(4u, 5u, vertices > 16u);
+    leaf.index_bits = select(4u, 5u, leaf.vertices > 16u);
     leaf.index_bytes = (leaf.faces * leaf.index_bits + 7u) / 8u;
-    let bytes = (vertices * leaf.bits + vec3<u32>(7u)) / vec3<u32>(8u);
-    let x = LEAF_HEADER_BYTES + columns_of_indices * leaf.index_bytes;
+    var coordinate_bits = leaf.vertices * leaf.bits;
+    if leaf.is_predicted {
+        coordinate_bits = 4u * leaf.bits + (leaf.vertices - 4u) * leaf.rest_bits;
+    }
+    let bytes = (coordinate_bits + vec3<u32>(7u)) / vec3<u32>(8u);
+    let x = leaf.indices + columns_of_indices * leaf.index_bytes;
     leaf.coordinates = vec3<u32>(x, x + bytes.x, x + bytes.x + bytes.y);
     leaf.extinctions = leaf.coordinates.z + bytes.z;
     leaf.radii = leaf.extinctions + select(2u * leaf.faces, 0u, leaf.is_opaque);
@@ -76,24 +106,68 @@ fn leaf_bits(leaf: Leaf, bit: u32, count: u32) -> u32 {
     return both & ((1u << count) - 1u);
 }
 
+fn stored_index(leaf: Leaf, face: u32, column: u32) -> u32 {
+    let byte = leaf.indices + column * leaf.index_bytes;
+    return leaf_bits(leaf, 8u * byte + face * leaf.index_bits, leaf.index_bits);
+}
+
 fn leaf_index(leaf: Leaf, face: u32, corner: u32) -> u32 {
+    if leaf.stride == 0u {
+        return stored_index(leaf, face, corner);
+    }
+    let step = select(select(leaf.stride, leaf.stride + 1u, corner == 2u), corner, corner < 2u);
     if leaf.columns > 0u {
-        let wide = leaf.columns + 1u;
-        let step = select(select(wide, wide + 1u, corner == 2u), corner, corner < 2u);
         return face + face / leaf.columns + step;
     }
-    let byte = LEAF_HEADER_BYTES + corner * leaf.index_bytes;
-    return leaf_bits(leaf, 8u * byte + face * leaf.index_bits, leaf.index_bits);
+    return stored_index(leaf, face, 0u) + step;
 }
 
 // The lattice coordinates of a vertex
 fn leaf_vertex(leaf: Leaf, vertex: u32) -> vec3<i32> {
-    let packed = vec3<u32>(
+    if leaf.is_predicted {
+        return leaf.origin + (predicted_vertex(leaf, vertex) << vec3<u32>(leaf.shift));
+    }
+    return leaf.origin + vec3<i32>(packed_vertex(leaf, vertex) << vec3<u32>(leaf.shift));
+}
+
+// A vertex as it is stored; in a predicted tile, a corner by its number among the corners
+fn packed_vertex(leaf: Leaf, vertex: u32) -> vec3<u32> {
+    return vec3<u32>(
         leaf_bits(leaf, 8u * leaf.coordinates.x + vertex * leaf.bits.x, leaf.bits.x),
         leaf_bits(leaf, 8u * leaf.coordinates.y + vertex * leaf.bits.y, leaf.bits.y),
         leaf_bits(leaf, 8u * leaf.coordinates.z + vertex * leaf.bits.z, leaf.bits.z),
     );
-    return leaf.origin + vec3<i32>(packed << vec3<u32>(leaf.shift));
+}
+
+// A vertex of a tile between its corners: bilinear between them, and what it differs by from that. Twin: leaf/predict.rs
+fn predicted_vertex(leaf: Leaf, vertex: u32) -> vec3<i32> {
+    let places = vec4<u32>(0u, leaf.stride - 1u, leaf.vertices - leaf.stride, leaf.vertices - 1u);
+    let before = dot(select(vec4<u32>(0u), vec4<u32>(1u), places < vec4<u32>(vertex)), vec4<u32>(1u));
+    if any(places == vec4<u32>(vertex)) {
+        return vec3<i32>(packed_vertex(leaf, before));
+    }
+    let bit = 8u * leaf.coordinates + 4u * leaf.bits + (vertex - before) * leaf.rest_bits;
+    let rest = vec3<i32>(
+        signed_bits(leaf, bit.x, leaf.rest_bits.x),
+        signed_bits(leaf, bit.y, leaf.rest_bits.y),
+        signed_bits(leaf, bit.z, leaf.rest_bits.z),
+    );
+    let rows = leaf.vertices / leaf.stride - 1u;
+    let across = (vertex % leaf.stride) * (256u / leaf.columns);
+    let down = (vertex / leaf.stride) * (256u / rows);
+    let first = vec3<i32>(packed_vertex(leaf, 0u));
+    let width = vec3<i32>(packed_vertex(leaf, 1u)) - first;
+    let below = vec3<i32>(packed_vertex(leaf, 2u));
+    let height = below - first;
+    let twist = vec3<i32>(packed_vertex(leaf, 3u)) - below - width;
+    let sum = i32(across) * width + i32(down) * height + i32((across * down) >> 8u) * twist;
+    return first + (sum >> vec3<u32>(8u)) + rest;
+}
+
+// `count` bits from bit `bit` of the leaf on, the highest of which is the sign
+fn signed_bits(leaf: Leaf, bit: u32, count: u32) -> i32 {
+    let unused = 32u - max(count, 1u);
+    return bitcast<i32>(leaf_bits(leaf, bit, count) << unused) >> unused;
 }
 
 fn leaf_extinction(leaf: Leaf, face: u32) -> u32 {

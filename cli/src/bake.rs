@@ -38,7 +38,7 @@ pub struct Arguments {
     lod: Lod,
     /// What stands in for what is not opened: `paper` (the paper's sums of areas, fast to build) or `directional` (from lines
     /// through the geometry; does not leak)
-    #[arg(long, value_name = "KIND", default_value = "paper", value_parser = str::parse::<FarField>)]
+    #[arg(long, value_name = "KIND", default_value = "directional", value_parser = str::parse::<FarField>)]
     farfield: FarField,
     /// Turns every point's rays differently; the same seed gives the same bytes
     #[arg(long, value_name = "S", default_value_t = 0)]

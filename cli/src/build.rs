@@ -23,7 +23,7 @@ pub struct Arguments {
     resources: Resources,
     /// What stands in for what is not opened: `paper` (the paper's sums of areas, fast to build) or `directional` (from lines
     /// through the geometry; does not leak)
-    #[arg(long, value_name = "KIND", default_value = "paper", value_parser = str::parse::<FarField>)]
+    #[arg(long, value_name = "KIND", default_value = "directional", value_parser = str::parse::<FarField>)]
     farfield: FarField,
     /// The frame that patterns such as `####` in the scene's paths stand for
     #[arg(long, value_name = "N", allow_negative_numbers = true)]

@@ -168,7 +168,7 @@ fn damaged_maps_are_refused() {
     let manifest = target.join("manifest.json");
     let text = std::fs::read_to_string(&manifest).unwrap();
     let lies = [
-        ("\"version\": 3", "\"version\": 4", ErrorKind::Unsupported),
+        ("\"version\": 4", "\"version\": 5", ErrorKind::Unsupported),
         ("\"bricks\": ", "\"bricks\": 4", ErrorKind::Corrupt),
         ("\"lattice_exponent\": ", "\"lattice_exponent\": 99", ErrorKind::Corrupt),
         ("{", "[", ErrorKind::Corrupt),

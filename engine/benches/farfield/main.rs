@@ -9,7 +9,7 @@ use std::time::Instant;
 use engine::brick::LatticeBox;
 use engine::brick::far::{self, Kind, SeenBox};
 use engine::brick::lanes::InstructionSet;
-use engine::brick::leaf::{EXTINCTION_PER_OCTAVE, Layout};
+use engine::brick::leaf::EXTINCTION_PER_OCTAVE;
 use engine::brick::node::Node;
 use engine::brickmap::bvh::{self, WideChild, WideTree};
 use engine::brickmap::chunk::Chunk;
@@ -17,7 +17,7 @@ use engine::brickmap::farfield::lines::{Directions, LINES_MAX, Lines, fibonacci}
 use engine::brickmap::farfield::shapes::Shapes;
 use engine::brickmap::farfield::shoot::Grove;
 use engine::brickmap::farfield::{directional, lost, paper};
-use engine::brickmap::pack::{Content, Primitive};
+use engine::brickmap::pack::Primitive;
 use engine::brickmap::spill::Quantised;
 use glam::Vec3;
 
@@ -72,12 +72,7 @@ impl Forest {
             })
             .collect();
         let mut shapes = Shapes::default();
-        for primitive in &primitives {
-            if let Content::Leaf { offset, .. } = primitive.content {
-                let leaf = &chunk.leaves[offset as usize..];
-                shapes.push(leaf, &Layout::read_trusted(leaf, primitive.bounds.min));
-            }
-        }
+        (0..chunk.leaves.len()).for_each(|leaf| shapes.push(&chunk.leaves.get(leaf)));
         Self { tree, nodes, shapes, primitives, sums }
     }
 

@@ -71,7 +71,7 @@ impl Default for BakeOptions {
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             device: Device::default(),
             lod: Lod::Off,
-            far_field: FarField::Paper,
+            far_field: FarField::Directional,
             seed: 0,
             samples: None,
             points_max: None,

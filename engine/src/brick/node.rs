@@ -154,13 +154,15 @@ impl Node {
     }
 
     /// The decoded box of a child: every number that belongs to a child (far field above all) belongs to this box.
+    #[inline(always)]
     pub fn child_box(&self, slot: usize) -> LatticeBox {
-        let corner = |faces: &[[u8; WIDTH]; 3]| {
-            IVec3::from_array(std::array::from_fn(|axis| {
-                self.origin[axis].wrapping_add(i32::from(faces[axis][slot]) << self.exponent[axis])
-            }))
-        };
-        LatticeBox { min: corner(&self.lower), max: corner(&self.upper) }
+        let (mut min, mut max) = (IVec3::from_array(self.origin), IVec3::from_array(self.origin));
+        for axis in 0..3 {
+            let exponent = self.exponent[axis];
+            min[axis] = min[axis].wrapping_add(i32::from(self.lower[axis][slot]) << exponent);
+            max[axis] = max[axis].wrapping_add(i32::from(self.upper[axis][slot]) << exponent);
+        }
+        LatticeBox { min, max }
     }
 
     /// Half the extents of [`child_box`](Self::child_box).

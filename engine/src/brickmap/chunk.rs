@@ -9,11 +9,12 @@ use glam::{IVec3, Vec3};
 use super::block::{Block, blocks};
 use super::cluster::{Item, cluster};
 use super::farfield;
+use super::leaves::Leaves;
 use super::pack::{Content, Primitive};
 use super::spill::Quantised;
 use super::tiling::Tilings;
 use crate::brick::LatticeBox;
-use crate::brick::leaf::{self, FACES_MAX, Face, OPAQUE};
+use crate::brick::leaf::{self, Contents, FACES_MAX, Face, Gathered, Kind, OPAQUE};
 
 /// Blocks of fewer quads than this are gathered with others.
 const BLOCK_FACES_MIN: usize = 6;
@@ -40,8 +41,8 @@ pub struct Skipped {
 pub struct Chunk {
     /// One primitive a leaf.
     pub clusters: Vec<Primitive>,
-    /// Their encoded leaves.
-    pub leaves: Vec<u8>,
+    /// What the leaves hold, in the same order.
+    pub leaves: Leaves,
     /// What was left out.
     pub skipped: Skipped,
     /// Faces that are in no tile: flat ones and round ones, of the grid at hand.
@@ -127,12 +128,11 @@ impl Chunk {
         }
     }
 
-    /// Makes leaves of the pooled faces, and room for those who read past the last leaf. Call it once, at the end.
+    /// Makes leaves of the pooled faces. Call it once, at the end.
     pub fn finish(&mut self) {
         for pool in std::mem::take(&mut self.pools) {
             self.gather(&pool);
         }
-        self.leaves.extend_from_slice(&[0; leaf::READ_PAST_BYTES]);
     }
 
     /// Makes leaves of loose faces.
@@ -216,7 +216,7 @@ impl Chunk {
         self.tilings = tilings;
     }
 
-    /// Encodes a tile unless some of its faces are missing or no quads.
+    /// Makes a leaf of a tile unless some of its faces are missing or no quads.
     fn push_tile(&mut self, grid: &Quantised, tile: &Block) -> bool {
         // Copy its rows of vertices
         let wide = tile.columns + 1;
@@ -258,10 +258,18 @@ impl Chunk {
                 faces += 1;
             }
         }
-        let offset = self.leaves.len();
-        let extinctions = &extinctions[..faces];
-        leaf::encode_tile(vertices, tile.columns, extinctions, grid.shift, bounds.min, &mut self.leaves);
-        self.record(bounds, [area, opaque_area], faces, offset);
+        let is_opaque = extinctions[..faces].iter().all(|&extinction| extinction == OPAQUE);
+        let tile = Contents {
+            kind: Kind::Tile,
+            faces,
+            stride: wide,
+            shift: grid.shift,
+            vertices,
+            indices: &[],
+            extinctions: if is_opaque { &[] } else { &extinctions[..faces] },
+            radii: &[],
+        };
+        self.record(bounds, [area, opaque_area], &tile);
         true
     }
 
@@ -280,7 +288,7 @@ impl Chunk {
         }
     }
 
-    /// Encodes a leaf. Until it is packed, it is relative to its own box.
+    /// Makes a leaf.
     fn push(&mut self, faces: &[Face], shift: u8) {
         let (mut bounds, mut area, mut opaque_area) = (LatticeBox::EMPTY, 0.0, 0.0);
         for face in faces {
@@ -289,15 +297,14 @@ impl Chunk {
             area += face_area;
             opaque_area += face_area * farfield::opacity(face.extinction);
         }
-        let offset = self.leaves.len();
-        leaf::encode(faces, shift, bounds.min, &mut self.leaves);
-        self.record(bounds, [area, opaque_area], faces.len(), offset);
+        self.record(bounds, [area, opaque_area], &Gathered::of(faces, shift).contents());
     }
 
-    /// Notes the leaf that was encoded from `offset` on.
-    fn record(&mut self, bounds: LatticeBox, [area, opaque_area]: [f32; 2], faces: usize, offset: usize) {
-        let content = Content::Leaf { offset: offset as u32, bytes: (self.leaves.len() - offset) as u32 };
-        self.clusters.push(Primitive { bounds, area, opaque_area, micropolygons: faces as u64, content });
+    /// Notes a leaf.
+    fn record(&mut self, bounds: LatticeBox, [area, opaque_area]: [f32; 2], leaf: &Contents<'_>) {
+        self.leaves.push(leaf);
+        let (micropolygons, content) = (leaf.faces as u64, Content::Leaf);
+        self.clusters.push(Primitive { bounds, area, opaque_area, micropolygons, content });
     }
 }
 

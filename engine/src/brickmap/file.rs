@@ -27,7 +27,7 @@ use crate::math::Bounds;
 use crate::{Error, ErrorKind, Result};
 
 /// The version of bricks and map. Others are refused.
-pub const FORMAT_VERSION: u32 = 3;
+pub const FORMAT_VERSION: u32 = 4;
 
 /// Bytes of a segment at most.
 pub(super) const SEGMENT_BYTES: u64 = 1 << 30;

@@ -252,6 +252,18 @@ impl Log {
 }
 
 impl Spilled {
+    /// Gives the disk back what its blocks take, where the system can: nobody reads them any more. So the log shrinks as the map
+    /// grows.
+    pub fn release(&self) {
+        #[cfg(target_os = "linux")]
+        for block in &self.blocks {
+            use rustix::fs::{FallocateFlags, fallocate};
+            let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+            // File systems without holes keep the bytes until the log is closed
+            _ = fallocate(&self.log.file, hole, block.offset, u64::from(block.bytes));
+        }
+    }
+
     /// The blocks one by one, in order, for threads to share.
     pub fn blocks(&self) -> impl Iterator<Item = Self> {
         debug_assert_eq!(self.skipped, 0);
@@ -317,8 +329,8 @@ mod tests {
     use super::super::spill::tests::sample;
     use super::*;
 
-    /// Catches a grid that gets into another partition, out of order, or lost between two blocks; and ranges that
-    /// share or drop one.
+    /// Catches a grid that gets into another partition, out of order, or lost between two blocks; ranges that share or drop
+    /// one; and a partition that takes others with it when it is released, or keeps the disk.
     #[test]
     fn partitions_come_back_in_order() {
         let folder = tempfile::tempdir().unwrap();
@@ -355,6 +367,13 @@ mod tests {
                 assert!(micropolygons < 1024, "{micropolygons}");
             }
             assert!(i >= 20_000, "ranges lose grids");
+            spilled.release();
+        }
+        #[cfg(target_os = "linux")]
+        {
+            use std::os::unix::fs::MetadataExt;
+            let kept = 512 * partitions[0].log.file.metadata().unwrap().blocks();
+            assert!(kept < bytes / 4, "{kept} of {bytes} bytes are still on the disk");
         }
     }
 }

@@ -21,6 +21,7 @@ pub mod farfield;
 pub mod file;
 mod fill;
 mod journal;
+pub mod leaves;
 mod log;
 mod output;
 pub mod pack;
@@ -173,34 +174,24 @@ pub fn build(
     let job = Job { options, progress, cancel };
     let mut report = BuildReport::default();
 
-    // What shares bricks, and what is expanded
+    // What shares bricks; pass 1: count what is expanded. What does not fit the lattice is expanded too
     let start = Instant::now();
-    let mut prototypes = find_prototypes(occluders, &job)?;
-    let shares: Vec<usize> = prototypes.iter().map(|prototype| prototype.occluder).collect();
-    let is_shared = |number: usize| shares.contains(&number);
     let occluder_geometries = geometries_of(occluders);
-
-    // Pass 1: count what is expanded
-    let mut numbers = Vec::new();
-    let mut streams: Vec<Box<dyn MicrogridStream + '_>> = Vec::new();
-    let mut shared = Vec::new();
-    for (number, occluder) in occluders.iter_mut().enumerate() {
-        match &mut occluder.instances {
-            _ if is_shared(number) => shared.push(&mut *occluder.stream),
-            None => streams.push(Box::new(&mut *occluder.stream)),
-            Some(source) => streams.push(Box::new(Instance::new(&mut *occluder.stream, &mut **source)?)),
+    let mut prototypes = find_prototypes(occluders, &job)?;
+    let (mut census, lattice) = loop {
+        let census = census::count(&mut Parted::new(occluders, &prototypes)?.flat(), &job)?;
+        let lattice = map_lattice(&census, &prototypes)?;
+        let before = prototypes.len();
+        prototypes.retain(|prototype| prototype.fits(&lattice));
+        if prototypes.len() == before {
+            break (census, lattice);
         }
-        if !is_shared(number) {
-            numbers.push(number);
-        }
-    }
-    let mut flat: Vec<OccluderStream<'_>> =
-        streams.iter_mut().map(|stream| OccluderStream::once(stream.as_mut())).collect();
-    let mut census = census::count(&mut flat, &job)?;
+    };
+    let mut parted = Parted::new(occluders, &prototypes)?;
     report.grids = census.grids + prototypes.iter().map(|prototype| prototype.grids).sum::<u64>();
-    let lattice = map_lattice(&census, &prototypes)?;
+    let shares: Vec<usize> = prototypes.iter().map(|prototype| prototype.occluder).collect();
     let mut shifts = census.shifts(&lattice);
-    let geometry_shifts = unite_shifts(&mut shifts, &numbers, &shares, occluder_geometries);
+    let geometry_shifts = unite_shifts(&mut shifts, &parted.numbers, &shares, occluder_geometries);
     let partitions = census.cells.partition(PARTITION_MICROPOLYGONS).len();
     report.count_seconds = start.elapsed().as_secs_f64();
 
@@ -216,16 +207,17 @@ pub fn build(
     // The prototypes, pass 2 and the partitions, the tree over all
     let done = (|| {
         let mut first = 0;
-        for (prototype, stream) in prototypes.iter_mut().zip(shared) {
+        for (prototype, stream) in prototypes.iter_mut().zip(std::mem::take(&mut parted.shared)) {
             first = build_prototype(prototype, stream, first, &mut output, &job, &mut report)?;
         }
         let whole = (first, partitions);
+        let mut flat = parted.flat();
         fill_and_build(&mut flat, census, (&lattice, &shifts), whole, &mut output, &job, &mut report)?;
         report.partitions = first - prototypes.len() + output.roots.len();
         let (mut placed, mut copies) = (Vec::new(), Vec::new());
         for (number, prototype) in prototypes.iter().enumerate() {
             if let Some(root) = output.prototypes[number].root {
-                prototype.place(number as u32, &root, &lattice, &mut placed, &mut copies)?;
+                prototype.place(number as u32, &root, &lattice, &mut placed, &mut copies);
             }
         }
         report.instances = copies.len() as u64;
@@ -276,6 +268,37 @@ pub fn build(
         transparent: skipped.transparent,
         ..report
     })
+}
+
+/// The occluders, parted into what is expanded and what shares bricks.
+struct Parted<'a> {
+    /// Places among the occluders of what is expanded.
+    numbers: Vec<usize>,
+    expanded: Vec<Box<dyn MicrogridStream + 'a>>,
+    shared: Vec<&'a mut dyn MicrogridStream>,
+}
+
+impl<'a> Parted<'a> {
+    fn new(occluders: &'a mut [OccluderStream<'_>], prototypes: &[Prototype]) -> Result<Self> {
+        let mut parted = Self { numbers: Vec::new(), expanded: Vec::new(), shared: Vec::new() };
+        for (number, occluder) in occluders.iter_mut().enumerate() {
+            if prototypes.iter().any(|prototype| prototype.occluder == number) {
+                parted.shared.push(&mut *occluder.stream);
+                continue;
+            }
+            parted.numbers.push(number);
+            parted.expanded.push(match &mut occluder.instances {
+                None => Box::new(&mut *occluder.stream),
+                Some(source) => Box::new(Instance::new(&mut *occluder.stream, &mut **source)?),
+            });
+        }
+        Ok(parted)
+    }
+
+    /// What is expanded, as streams that stand once.
+    fn flat(&mut self) -> Vec<OccluderStream<'_>> {
+        self.expanded.iter_mut().map(|stream| OccluderStream::once(stream.as_mut())).collect()
+    }
 }
 
 /// The geometries whose copies share bricks, in their order.

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::bvh;
 use super::chunk::Skipped;
 use super::farfield;
+use super::leaves::Leaves;
 use super::pack::{self, ByteSplit, Far, Packed, Primitive, Top};
 use super::shared::Placed;
 use super::writer::MapWriter;
@@ -166,7 +167,14 @@ impl Output {
         // A directional far field says something of every root, the paper's of none
         let is_paper = self.far_roots.is_empty() && prototypes.is_empty();
         let top = Top { is_paper, roots: &self.far_roots, prototypes: &prototypes, placed };
-        Some(pack::pack(&tree, &primitives, &[], self.writer.bricks(), Far::Over(&top), packed))
+        Some(pack::pack(
+            &tree,
+            &primitives,
+            &Leaves::default(),
+            self.writer.bricks(),
+            Far::Over(&top),
+            packed,
+        ))
     }
 
     fn count(&mut self, note: Note) {

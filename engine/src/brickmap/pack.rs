@@ -6,11 +6,13 @@
 
 use super::bvh::{WideChild, WideNode, WideTree};
 use super::farfield::{self, shapes::Shapes};
+use super::leaves::Leaves;
 use super::shared::Placed;
 use crate::brick::lanes::InstructionSet;
-use crate::brick::leaf::{self, Layout};
 use crate::brick::node::{LOCATION_BYTES, WIDTH};
-use crate::brick::{CHILDREN_MAX, Child, INSTANCE_BYTES, LatticeBox, Node, assemble};
+use crate::brick::{
+    ALIGNMENT, CHILDREN_MAX, Child, HEADER_BYTES, INSTANCE_BYTES, LatticeBox, Node, assemble,
+};
 
 /// Bytes that a brick's nodes and leaves take at most, unless a single node's leaves take more. Smaller bricks waste headers,
 /// larger ones load what a batch does not touch.
@@ -19,13 +21,8 @@ const TREELET_BYTES: usize = 12 << 10;
 /// What a primitive of the tree is.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub enum Content {
-    /// A leaf, by its place among the encoded leaves.
-    Leaf {
-        /// First byte.
-        offset: u32,
-        /// Bytes.
-        bytes: u32,
-    },
+    /// A leaf, of the same number.
+    Leaf,
     /// A brick that is written already.
     Brick(u32),
     /// A copy of a prototype, by its place among all of the top level.
@@ -99,31 +96,32 @@ struct Subtree {
     is_brick: bool,
 }
 
-/// Packs `tree` over `primitives` into bricks numbered from `first_number` on. `leaves` holds the encoded leaves and runs on
-/// past its end by [`READ_PAST_BYTES`](crate::brick::leaf::READ_PAST_BYTES). Returns the root brick as a primitive of a
-/// higher tree.
+/// Packs `tree` over `primitives` into bricks numbered from `first_number` on. `leaves` has what those primitives hold that are
+/// leaves. Returns the root brick as a primitive of a higher tree.
 pub fn pack(
     tree: &WideTree,
     primitives: &[Primitive],
-    leaves: &[u8],
+    leaves: &Leaves,
     first_number: u32,
     far: Far<'_>,
     out: &mut Packed,
 ) -> Primitive {
-    let mut subtrees = measure(tree, primitives);
-    subtrees[0].is_brick = true;
+    let mut subtrees = sum_up(tree, primitives);
     let mut nodes = nodes(tree, primitives, &subtrees);
     match far {
         Far::Paper => fill_paper(tree, primitives, &subtrees, &mut nodes),
         Far::Directional(others) => {
-            out.root = Some(fill_directional(tree, primitives, leaves, others, &mut nodes));
+            out.root = Some(fill_directional(tree, leaves, others, &mut nodes));
         }
         Far::Over(top) if top.is_paper => fill_paper(tree, primitives, &subtrees, &mut nodes),
         Far::Over(top) => farfield::top::fill(tree, primitives, top, &mut nodes),
     }
+    let encoded = Encoded::of(tree, &nodes, leaves);
+    let bytes = cut(tree, primitives, &encoded, &mut subtrees);
+    out.bytes.reserve(bytes);
     let placed = if let Far::Over(top) = far { top.placed } else { &[] };
     let mut packer =
-        Packer { tree, primitives, leaves, placed, subtrees: &subtrees, nodes, first_number, out };
+        Packer { tree, primitives, encoded, placed, subtrees: &subtrees, nodes, first_number, out };
     let number = packer.brick(0);
     let root = &subtrees[0];
     Primitive {
@@ -132,6 +130,37 @@ pub fn pack(
         opaque_area: root.opaque_area as f32,
         micropolygons: root.micropolygons,
         content: Content::Brick(number),
+    }
+}
+
+/// Leaves as they are written, each relative to its box as its node has it.
+struct Encoded {
+    bytes: Vec<u8>,
+    /// First byte of each and the byte after its last.
+    places: Vec<[u32; 2]>,
+}
+
+impl Encoded {
+    fn of(tree: &WideTree, nodes: &[Node], leaves: &Leaves) -> Self {
+        let mut encoded = Self { bytes: Vec::new(), places: vec![[0; 2]; leaves.len()] };
+        if leaves.is_empty() {
+            return encoded;
+        }
+        for (node, wide) in nodes.iter().zip(&tree.nodes) {
+            for (slot, child) in wide.children[..usize::from(wide.count)].iter().enumerate() {
+                if let WideChild::Primitive(leaf) = *child {
+                    let start = encoded.bytes.len() as u32;
+                    leaves.get(leaf as usize).encode(node.lower_corner(slot), &mut encoded.bytes);
+                    encoded.places[leaf as usize] = [start, encoded.bytes.len() as u32];
+                }
+            }
+        }
+        encoded
+    }
+
+    fn leaf(&self, leaf: u32) -> &[u8] {
+        let [start, end] = self.places[leaf as usize];
+        &self.bytes[start as usize..end as usize]
     }
 }
 
@@ -187,18 +216,12 @@ fn fill_paper(tree: &WideTree, primitives: &[Primitive], subtrees: &[Subtree], n
 /// Fills the nodes over leaves with the directional far field and returns what it is of the root.
 fn fill_directional(
     tree: &WideTree,
-    primitives: &[Primitive],
-    leaves: &[u8],
+    leaves: &Leaves,
     others: farfield::Others<'_>,
     nodes: &mut [Node],
 ) -> farfield::Root {
     let mut shapes = Shapes::default();
-    for primitive in primitives {
-        if let Content::Leaf { offset, .. } = primitive.content {
-            let leaf = &leaves[offset as usize..];
-            shapes.push(leaf, &Layout::read_trusted(leaf, primitive.bounds.min));
-        }
-    }
+    (0..leaves.len()).for_each(|leaf| shapes.push(&leaves.get(leaf)));
     let (records, root) = farfield::directional(tree, nodes, &shapes, others, InstructionSet::detect());
     nodes.iter_mut().zip(records).for_each(|(node, far)| node.far = far);
     root
@@ -218,8 +241,8 @@ fn areas(child: &WideChild, primitives: &[Primitive], subtrees: &[Subtree]) -> (
     }
 }
 
-/// Sums up every subtree and decides which become bricks.
-fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
+/// Sums up every subtree; none is a brick yet.
+fn sum_up(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
     let empty = Subtree {
         bounds: LatticeBox::EMPTY,
         area: 0.0,
@@ -231,9 +254,7 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
     };
     let mut subtrees = vec![empty; tree.nodes.len()];
     for (index, node) in tree.nodes.iter().enumerate().rev() {
-        let mut sum = Subtree { bytes: size_of::<Node>(), nodes: 1, ..empty };
-        let mut inner = [0; WIDTH];
-        let mut inner_count = 0;
+        let mut sum = empty;
         for child in &node.children[..usize::from(node.count)] {
             match *child {
                 WideChild::Primitive(primitive) => {
@@ -242,11 +263,6 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
                     sum.area += f64::from(p.area);
                     sum.opaque_area += f64::from(p.opaque_area);
                     sum.micropolygons += p.micropolygons;
-                    sum.bytes += match p.content {
-                        Content::Leaf { bytes, .. } => bytes as usize,
-                        Content::Brick(_) => 8,
-                        Content::Instance(_) => INSTANCE_BYTES,
-                    };
                 }
                 WideChild::Node(child) => {
                     let below = &subtrees[child as usize];
@@ -254,8 +270,33 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
                     sum.area += below.area;
                     sum.opaque_area += below.opaque_area;
                     sum.micropolygons += below.micropolygons;
-                    sum.bytes += below.bytes;
-                    sum.nodes += below.nodes;
+                }
+            }
+        }
+        subtrees[index] = sum;
+    }
+    subtrees
+}
+
+/// Decides which subtrees become bricks, the whole tree in any case. Returns about how many bytes all of them take.
+fn cut(tree: &WideTree, primitives: &[Primitive], encoded: &Encoded, subtrees: &mut [Subtree]) -> usize {
+    let mut total = 0;
+    for (index, node) in tree.nodes.iter().enumerate().rev() {
+        let (mut bytes, mut nodes) = (size_of::<Node>(), 1);
+        let mut inner = [0; WIDTH];
+        let mut inner_count = 0;
+        for child in &node.children[..usize::from(node.count)] {
+            match *child {
+                WideChild::Primitive(primitive) => {
+                    bytes += match primitives[primitive as usize].content {
+                        Content::Leaf => encoded.leaf(primitive).len(),
+                        Content::Brick(_) => 8,
+                        Content::Instance(_) => INSTANCE_BYTES,
+                    };
+                }
+                WideChild::Node(child) => {
+                    bytes += subtrees[child as usize].bytes;
+                    nodes += subtrees[child as usize].nodes;
                     inner[inner_count] = child as usize;
                     inner_count += 1;
                 }
@@ -265,23 +306,25 @@ fn measure(tree: &WideTree, primitives: &[Primitive]) -> Vec<Subtree> {
         let inner = &mut inner[..inner_count];
         inner.sort_by_key(|&child| std::cmp::Reverse(subtrees[child].bytes));
         for &child in inner.iter() {
-            if sum.bytes <= TREELET_BYTES && sum.nodes <= CHILDREN_MAX / WIDTH {
+            if bytes <= TREELET_BYTES && nodes <= CHILDREN_MAX / WIDTH {
                 break;
             }
-            sum.bytes -= subtrees[child].bytes - 8;
-            sum.nodes -= subtrees[child].nodes;
+            bytes -= subtrees[child].bytes - 8;
+            nodes -= subtrees[child].nodes;
             subtrees[child].is_brick = true;
+            total += subtrees[child].bytes + HEADER_BYTES + ALIGNMENT;
         }
-        subtrees[index] = sum;
+        (subtrees[index].bytes, subtrees[index].nodes) = (bytes, nodes);
     }
-    subtrees
+    subtrees[0].is_brick = true;
+    total + subtrees[0].bytes + HEADER_BYTES + ALIGNMENT
 }
 
 /// Writes bricks.
 struct Packer<'a> {
     tree: &'a WideTree,
     primitives: &'a [Primitive],
-    leaves: &'a [u8],
+    encoded: Encoded,
     placed: &'a [Placed],
     subtrees: &'a [Subtree],
     nodes: Vec<Node>,
@@ -323,15 +366,12 @@ impl Packer<'_> {
                         next_member += 1;
                         Child::Node(next_member - 1)
                     }
-                    WideChild::Primitive(primitive) => {
-                        let primitive = &self.primitives[primitive as usize];
+                    WideChild::Primitive(number) => {
+                        let primitive = &self.primitives[number as usize];
                         match primitive.content {
-                            Content::Leaf { offset, bytes } => {
+                            Content::Leaf => {
                                 let here = (leaves.len() / LOCATION_BYTES) as u16;
-                                let leaf = &self.leaves[offset as usize..(offset + bytes) as usize];
-                                // A leaf belongs to its box as the node has it
-                                let corner = node.child_box(slot).min;
-                                leaf::rebase(leaf, primitive.bounds.min, corner, &mut leaves);
+                                leaves.extend_from_slice(self.encoded.leaf(number));
                                 micropolygons += primitive.micropolygons as u32;
                                 Child::Leaf(here)
                             }

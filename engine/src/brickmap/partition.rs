@@ -77,6 +77,8 @@ struct Part {
     /// Whether it ends with this part.
     is_last: bool,
     grids: Spilled,
+    /// Whether no other part has grids in the same blocks.
+    is_alone: bool,
     /// Boxes of other partitions, and of other parts of the same one, that touch its own.
     others: Vec<LatticeBox>,
 }
@@ -102,7 +104,7 @@ fn cut_again(
     job: &Job<'_>,
 ) -> Result<()> {
     if grids.micropolygons <= 2 * PARTITION_MICROPOLYGONS {
-        parts.push(Part { partition, is_last: false, grids, others: Vec::new() });
+        parts.push(Part { partition, is_last: false, grids, is_alone: true, others: Vec::new() });
         return Ok(());
     }
 
@@ -111,11 +113,18 @@ fn cut_again(
     if pieces == 1 || depth == CUTS_MAX {
         // It lies on one spot, or is nested too deep: by number
         let ranges = grids.ranges(PARTITION_MICROPOLYGONS).into_iter();
-        parts.extend(ranges.map(|grids| Part { partition, is_last: false, grids, others: Vec::new() }));
+        parts.extend(ranges.map(|grids| Part {
+            partition,
+            is_last: false,
+            grids,
+            is_alone: false,
+            others: Vec::new(),
+        }));
         return Ok(());
     }
     let (pieces, bytes) = spill_again(&grids, &cells, pieces, job)?;
     *spilled_bytes += bytes;
+    grids.release();
     drop((grids, cells));
     pieces.into_iter().try_for_each(|piece| cut_again(piece, depth + 1, partition, parts, spilled_bytes, job))
 }
@@ -174,6 +183,9 @@ fn build(part: &Part, job: &Job<'_>) -> Result<Built> {
         chunk.add(grid);
         Ok(())
     })?;
+    if part.is_alone {
+        part.grids.release();
+    }
     job.check()?;
     chunk.finish();
     let Chunk { clusters, leaves, skipped, .. } = chunk;

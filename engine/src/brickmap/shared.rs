@@ -3,8 +3,11 @@
 //! A geometry with copies is a prototype, built once as a tree on a lattice of its own, if
 //!
 //! - it has at least two copies, and all maps together at most [`INSTANCES_MAX`],
-//! - all its copies together have at least [`MICROPOLYGONS_MIN`] micropolygons, and
-//! - every copy's map can be stored in a [record](crate::brick::instance).
+//! - all its copies together have at least [`MICROPOLYGONS_MIN`] micropolygons,
+//! - a place in a copy lies in at most [`OVERLAP_MAX`] copies on the average, or all copies together have more than
+//!   [`EXPANDED_MAX`] micropolygons, and
+//! - every copy's map can be stored in a [record](crate::brick::instance), and none is so small for the map's extent that its
+//!   rays could not be told from each other.
 //!
 //! Otherwise its copies are expanded. That depends on the inputs alone, never on memory or threads.
 
@@ -25,6 +28,13 @@ pub const INSTANCES_MAX: usize = 1 << 19;
 
 /// Micropolygons of all copies of a geometry from which they share bricks. Smaller ones are traced faster when they are expanded.
 pub const MICROPOLYGONS_MIN: u64 = 1 << 20;
+
+/// Copies that a place in one of them lies in, on the average, from which on their trees are so often walked one after the other
+/// that one tree over all of them is faster by more than a quarter. Measured: `docs/performance/build.md`.
+pub const OVERLAP_MAX: f64 = 4.0;
+
+/// Micropolygons of all copies of a geometry that are not expanded however much they overlap.
+pub const EXPANDED_MAX: u64 = 1 << 26;
 
 /// A geometry whose copies share bricks.
 #[derive(Debug)]
@@ -64,6 +74,15 @@ impl Placed {
         Instance::new(self.brick, self.linear, self.linear * corner.as_dvec3() + self.base)
     }
 
+    /// Whether a record can hold it, wherever its prototype's box `own` lies in the decoded box of its node.
+    fn can_hold(&self, own: &LatticeBox) -> bool {
+        // The decoded box begins a little below: by at most a 255th of its node, twice
+        let bounds = self.bounds(own);
+        let slack = 3.0 * exp2(24) * self.linear.to_cols_array().iter().fold(0.0_f64, |l, x| l.max(x.abs()));
+        let corner = self.linear * bounds.min.as_dvec3() + self.base;
+        self.record(bounds.min).is_some() && corner.abs().max_element() + slack < exp2(34)
+    }
+
     /// The box that holds a box of the prototype's lattice.
     fn bounds(&self, own: &LatticeBox) -> LatticeBox {
         let map_from_prototype = self.linear.inverse();
@@ -95,7 +114,10 @@ impl Prototype {
         }
         let mut own = [OccluderStream::once(&mut *stream.stream)];
         let census = census::count(&mut own, job)?;
-        if census.faces() * (matrices.len() as u64) < MICROPOLYGONS_MIN {
+        let micropolygons = census.faces().saturating_mul(matrices.len() as u64);
+        if micropolygons < MICROPOLYGONS_MIN
+            || micropolygons <= EXPANDED_MAX && overlap(&matrices, &census.bounds) > OVERLAP_MAX
+        {
             return Ok(None);
         }
         let mut content = xxhash_rust::xxh3::Xxh3::new();
@@ -161,10 +183,30 @@ impl Prototype {
         self.lattice.exponent + ((smallest.to_bits() >> 52) & 0x7ff) as i32 - 1023
     }
 
-    /// Places all copies of the tree that is `root` in a map with `lattice`.
-    ///
-    /// # Errors
-    /// [`ErrorKind::Limit`](crate::ErrorKind::Limit) when a copy is too small for the map's extent.
+    /// Whether records can hold all copies on the map's `lattice`.
+    pub fn fits(&self, lattice: &Lattice) -> bool {
+        let own = LatticeBox {
+            min: self.lattice.exact(self.bounds.min).floor().as_ivec3(),
+            max: self.lattice.exact(self.bounds.max).ceil().as_ivec3(),
+        };
+        self.matrices.iter().all(|matrix| self.placed(matrix, (0, 0), lattice).can_hold(&own))
+    }
+
+    /// A copy of prototype `number`, whose root brick is `brick`.
+    fn placed(&self, matrix: &DMat4, (number, brick): (u32, u32), lattice: &Lattice) -> Placed {
+        let (step, own_step) = (lattice.step(), self.lattice.step());
+        let zero = lattice.origin.as_dvec3() * step;
+        let object_from_world = DMat3::from_mat4(*matrix).inverse();
+        let at_zero = object_from_world * (zero - matrix.w_axis.truncate());
+        Placed {
+            prototype: number,
+            brick,
+            linear: object_from_world * (step / own_step),
+            base: at_zero / own_step - self.lattice.origin.as_dvec3(),
+        }
+    }
+
+    /// Places all copies of the tree that is `root` in a map with `lattice`, which they [fit](Self::fits).
     pub fn place(
         &self,
         number: u32,
@@ -172,33 +214,13 @@ impl Prototype {
         lattice: &Lattice,
         placed: &mut Vec<Placed>,
         primitives: &mut Vec<Primitive>,
-    ) -> Result<()> {
-        let Content::Brick(brick) = root.content else { return Ok(()) };
-        let (step, own_step) = (lattice.step(), self.lattice.step());
-        let zero = lattice.origin.as_dvec3() * step;
-        for (copy, matrix) in self.matrices.iter().enumerate() {
-            let object_from_world = DMat3::from_mat4(*matrix).inverse();
-            let linear = object_from_world * (step / own_step);
-            let at_zero = object_from_world * (zero - matrix.w_axis.truncate());
-            let base = at_zero / own_step - self.lattice.origin.as_dvec3();
-            let one = Placed { prototype: number, brick, linear, base };
-            let bounds = one.bounds(&root.bounds);
-            // The decoded box begins a little below: by at most a 255th of its node, twice
-            let slack = 3.0 * exp2(24) * linear.to_cols_array().iter().fold(0.0_f64, |l, x| l.max(x.abs()));
-            let corner = linear * bounds.min.as_dvec3() + base;
-            if one.record(bounds.min).is_none() || corner.abs().max_element() + slack >= exp2(34) {
-                return Err(Error::new(
-                    crate::ErrorKind::Limit,
-                    format!(
-                        "instance {copy} of occluder {} is too small for the scene's extent",
-                        self.occluder
-                    ),
-                )
-                .hint("split the scene, or give the copies a common scale"));
-            }
-            let area_scale = cube_root(1.0 / linear.determinant().abs()).powi(2) as f32;
+    ) {
+        let Content::Brick(brick) = root.content else { return };
+        for matrix in &self.matrices {
+            let one = self.placed(matrix, (number, brick), lattice);
+            let area_scale = cube_root(1.0 / one.linear.determinant().abs()).powi(2) as f32;
             primitives.push(Primitive {
-                bounds,
+                bounds: one.bounds(&root.bounds),
                 area: root.area * area_scale,
                 opaque_area: root.opaque_area * area_scale,
                 micropolygons: root.micropolygons,
@@ -206,8 +228,32 @@ impl Prototype {
             });
             placed.push(one);
         }
-        Ok(())
     }
+}
+
+/// How many copies a place in a copy lies in on the average, itself included: their volume over that of the cells, as large as the
+/// largest copy, in which they have their centres. Small copies among large ones count for less.
+fn overlap(matrices: &[DMat4], bounds: &Bounds) -> f64 {
+    let (size, center) = (bounds.size(), bounds.center());
+    let extent = |matrix: &DMat4| size.max_element() * scale_of(matrix);
+    let edge = matrices.iter().map(extent).fold(0.0, f64::max);
+    if edge.is_nan() || edge <= 0.0 {
+        return 0.0;
+    }
+    let mut cells: Vec<([i64; 3], f64)> = matrices
+        .iter()
+        .map(|matrix| {
+            let cell = (matrix.transform_point3(center) / edge).floor().as_i64vec3();
+            (cell.to_array(), size.element_product() * DMat3::from_mat4(*matrix).determinant().abs())
+        })
+        .collect();
+    cells.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let (mut squares, mut sum) = (0.0, 0.0);
+    for cell in cells.chunk_by(|a, b| a.0 == b.0) {
+        let volume: f64 = cell.iter().map(|copy| copy.1).sum();
+        (squares, sum) = (squares + volume * volume, sum + volume);
+    }
+    if sum > 0.0 { squares / sum / edge.powi(3) } else { 0.0 }
 }
 
 impl Census {
@@ -240,4 +286,35 @@ fn scale_of(matrix: &DMat4) -> f64 {
 fn corners(low: DVec3, high: DVec3) -> impl Iterator<Item = DVec3> {
     let ends = [low, high];
     (0..8).map(move |i| DVec3::new(ends[i & 1].x, ends[i >> 1 & 1].y, ends[i >> 2 & 1].z))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Catches an overlap that is not how many copies lie over each other, whatever their size and wherever they are.
+    #[test]
+    fn overlap_counts_copies() {
+        let bounds = Bounds { min: DVec3::splat(-1.0), max: DVec3::ONE };
+        let rows = |spacing: f64, scale: f64| -> Vec<DMat4> {
+            let at = |i: i32| DVec3::new(f64::from(i % 16), f64::from(i / 16 % 16), f64::from(i / 256));
+            (0..4096)
+                .map(|i| {
+                    DMat4::from_translation(at(i) * spacing * scale + 5e5)
+                        * DMat4::from_scale(DVec3::splat(scale))
+                })
+                .collect()
+        };
+        for (spacing, expected) in [(2.0, 1.0), (1.0, 8.0), (0.5, 64.0)] {
+            for scale in [1.0, 0.01] {
+                let found = overlap(&rows(spacing, scale), &bounds);
+                assert!((0.7 * expected..1.4 * expected).contains(&found), "{spacing}: {found}");
+            }
+        }
+        // One large copy among small ones that lie apart
+        let mut apart = rows(3.0, 1.0);
+        apart.push(DMat4::from_scale(DVec3::splat(40.0)));
+        assert!(overlap(&apart, &bounds) < 1.0);
+        assert_eq!(overlap(&[DMat4::IDENTITY; 3], &Bounds { min: DVec3::ZERO, max: DVec3::ZERO }), 0.0);
+    }
 }

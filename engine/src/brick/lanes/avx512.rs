@@ -10,7 +10,7 @@ use glam::{IVec3, Vec3};
 use super::plain::Plain;
 use super::{BOX_ERROR, Boxes, Corners, Lanes, Look, Planes, SLACK};
 use crate::brick::bundle::{BoxOrigins, BoxRay, POINTS_MAX};
-use crate::brick::leaf::{HEADER_BYTES, Kind, Layout};
+use crate::brick::leaf::{Kind, Layout, predict};
 use crate::brick::node::{LOCATION_BITS, Node, WIDTH};
 
 /// The loops for AVX-512 F, BW, DQ, VL, VBMI and VBMI2.
@@ -171,16 +171,18 @@ impl Lanes for Avx512 {
 
     #[inline(always)]
     unsafe fn corners(leaf: &[u8], layout: &Layout, reference: IVec3, out: &mut Corners) {
-        if layout.bits[0].max(layout.bits[1]).max(layout.bits[2]) > LANE_BITS_MAX {
+        let widest = |bits: [u8; 3]| bits[0].max(bits[1]).max(bits[2]);
+        if widest(layout.bits).max(layout.rest_bits.map_or(0, widest)) > LANE_BITS_MAX {
             // SAFETY: the caller's
             return unsafe { Plain::corners(leaf, layout, reference, out) };
         }
         debug_assert!(leaf.len() >= layout.bytes + crate::brick::leaf::READ_PAST_BYTES);
-        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 40 bytes from byte 4,
+        // SAFETY: the leaf was checked and may be read 64 bytes past its end: indices take at most 40 bytes from byte 4 on,
         // and 16 coordinates start within the leaf
         unsafe {
             // Unpack the vertices relative to the reference
             let many = layout.vertices > 16;
+            let tile = layout.rest_bits.map(|rest_bits| (PredictedTile::of(layout), rest_bits));
             let zero = _mm512_setzero_si512();
             let (mut first, mut second) = ([zero; 3], [zero; 3]);
             for axis in 0..3 {
@@ -188,15 +190,22 @@ impl Lanes for Avx512 {
                 let base = _mm512_set1_epi32(layout.origin[axis].wrapping_sub(reference[axis]));
                 let shift = _mm_cvtsi32_si128(i32::from(layout.shift));
                 let packed = leaf.as_ptr().add(layout.coordinates[axis]);
-                first[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpack(packed, bits), shift), base);
+                let unpacked = match &tile {
+                    Some((tile, rest_bits)) => tile.unpack(packed, bits, rest_bits[axis]),
+                    None => unpack(packed, bits),
+                };
+                first[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpacked, shift), base);
                 if many {
                     let packed = packed.add(2 * usize::from(bits));
                     second[axis] = _mm512_add_epi32(_mm512_sll_epi32(unpack(packed, bits), shift), base);
                 }
             }
 
-            let lanes = if layout.kind == Kind::Tile {
-                tile_lanes(layout.columns)
+            let lanes = if layout.columns > 0 {
+                row_lanes(tile_faces(layout.columns), layout.stride)
+            } else if layout.stride > 0 {
+                let firsts = unpack(leaf.as_ptr().add(layout.indices), layout.index_bits as u8);
+                row_lanes(pair(firsts, firsts), layout.stride)
             } else {
                 index_lanes(leaf, layout)
             };
@@ -378,20 +387,98 @@ unsafe fn four_of(rays: &[BoxRay], id: u16) -> __m128 {
     unsafe { _mm_load_ps(std::ptr::from_ref(rays.get_unchecked(usize::from(id))).cast()) }
 }
 
-/// The vertices of a tile's triangles, per corner.
+/// The first vertices of a tile's triangles.
 #[inline(always)]
-unsafe fn tile_lanes(columns: usize) -> [__m512i; 3] {
+unsafe fn tile_faces(columns: usize) -> __m512i {
     // SAFETY: no memory is touched
     unsafe {
         let face = _mm512_set_epi32(7, 6, 5, 4, 3, 2, 1, 0, 7, 6, 5, 4, 3, 2, 1, 0);
         // face / columns for up to 8 of each, by multiplication
         let inverse = _mm512_set1_epi32(256 / columns as i32 + 1);
-        let row = _mm512_srli_epi32::<8>(_mm512_mullo_epi32(face, inverse));
-        let first = _mm512_add_epi32(face, row);
-        let wide = columns as i32 + 1;
-        let second = _mm512_mask_set1_epi32(_mm512_set1_epi32(1), 0xff00, wide + 1);
-        let third = _mm512_mask_set1_epi32(_mm512_set1_epi32(wide + 1), 0xff00, wide);
+        _mm512_add_epi32(face, _mm512_srli_epi32::<8>(_mm512_mullo_epi32(face, inverse)))
+    }
+}
+
+/// The vertices of the triangles of quads in rows, per corner.
+#[inline(always)]
+unsafe fn row_lanes(first: __m512i, stride: usize) -> [__m512i; 3] {
+    // SAFETY: no memory is touched
+    unsafe {
+        let stride = stride as i32;
+        let second = _mm512_mask_set1_epi32(_mm512_set1_epi32(1), 0xff00, stride + 1);
+        let third = _mm512_mask_set1_epi32(_mm512_set1_epi32(stride + 1), 0xff00, stride);
         [first, _mm512_add_epi32(first, second), _mm512_add_epi32(first, third)]
+    }
+}
+
+/// What is the same for all axes of a predicted tile, a lane a vertex. See [`predict`](crate::brick::leaf::predict).
+struct PredictedTile {
+    corners: [__m512i; 4],
+    /// Lanes of corners.
+    are_corners: u16,
+    /// Where a corner stands among the corners, another vertex among the others.
+    place: __m512i,
+    weights: [__m512i; 3],
+}
+
+impl PredictedTile {
+    #[inline(always)]
+    unsafe fn of(layout: &Layout) -> Self {
+        let corners = predict::corners(layout.stride, layout.vertices);
+        let rows = layout.vertices / layout.stride - 1;
+        let lanes = &predict::LANES[layout.columns - 1][rows - 1];
+        // SAFETY: loads are of whole arrays
+        unsafe {
+            let weights =
+                |kind: usize| _mm512_cvtepu16_epi32(_mm256_loadu_si256(lanes.weights[kind].as_ptr().cast()));
+            Self {
+                corners: corners.map(|corner| _mm512_set1_epi32(corner as i32)),
+                are_corners: corners.iter().fold(0, |all, &corner| all | 1 << corner),
+                place: _mm512_cvtepu8_epi32(_mm_loadu_si128(lanes.places.as_ptr().cast())),
+                weights: [weights(0), weights(1), weights(2)],
+            }
+        }
+    }
+
+    /// The coordinates along an axis whose column starts at `packed`.
+    #[inline(always)]
+    unsafe fn unpack(&self, packed: *const u8, bits: u8, rest_bits: u8) -> __m512i {
+        // SAFETY: the caller may read 64 bytes
+        unsafe {
+            // Corners come first
+            let width = _mm512_mask_set1_epi32(
+                _mm512_set1_epi32(i32::from(rest_bits)),
+                self.are_corners,
+                i32::from(bits),
+            );
+            let bit = _mm512_mullo_epi32(self.place, width);
+            let after_corners = _mm512_set1_epi32(4 * i32::from(bits));
+            let bit = _mm512_mask_add_epi32(bit, !self.are_corners, bit, after_corners);
+            let words = words_at(packed, bit);
+            // A corner as it is, of what others differ by the sign too
+            let unused = _mm512_sub_epi32(_mm512_set1_epi32(32), width);
+            let high = _mm512_sllv_epi32(words, unused);
+            let stored =
+                _mm512_mask_srlv_epi32(_mm512_srav_epi32(high, unused), self.are_corners, high, unused);
+            let [first, right, below, last] = [
+                _mm512_permutexvar_epi32(self.corners[0], stored),
+                _mm512_permutexvar_epi32(self.corners[1], stored),
+                _mm512_permutexvar_epi32(self.corners[2], stored),
+                _mm512_permutexvar_epi32(self.corners[3], stored),
+            ];
+            let height = _mm512_sub_epi32(below, first);
+            let twist = _mm512_sub_epi32(_mm512_sub_epi32(last, right), height);
+            let [across, down, both] = self.weights;
+            let sum = _mm512_add_epi32(
+                _mm512_add_epi32(
+                    _mm512_mullo_epi32(across, _mm512_sub_epi32(right, first)),
+                    _mm512_mullo_epi32(down, height),
+                ),
+                _mm512_mullo_epi32(both, twist),
+            );
+            let expected = _mm512_add_epi32(first, _mm512_srai_epi32::<8>(sum));
+            _mm512_mask_add_epi32(stored, !self.are_corners, stored, expected)
+        }
     }
 }
 
@@ -400,7 +487,7 @@ unsafe fn tile_lanes(columns: usize) -> [__m512i; 3] {
 unsafe fn index_lanes(leaf: &[u8], layout: &Layout) -> [__m512i; 3] {
     // SAFETY: the caller's leaf may be read 64 bytes past its end
     unsafe {
-        let indices = leaf.as_ptr().add(HEADER_BYTES);
+        let indices = leaf.as_ptr().add(layout.indices);
         let mut column = [_mm512_setzero_si512(); 4];
         for (corner, column) in column.iter_mut().enumerate().take(layout.kind.corners()) {
             let packed = indices.add(corner * layout.index_bytes);
@@ -418,13 +505,21 @@ unsafe fn index_lanes(leaf: &[u8], layout: &Layout) -> [__m512i; 3] {
 unsafe fn unpack(packed: *const u8, bits: u8) -> __m512i {
     // SAFETY: the caller may read 64 bytes
     unsafe {
-        let bytes = _mm512_loadu_si512(packed.cast());
         let lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
         let bit = _mm512_mullo_epi32(lane, _mm512_set1_epi32(i32::from(bits)));
+        _mm512_and_si512(words_at(packed, bit), _mm512_set1_epi32((1 << bits) - 1))
+    }
+}
+
+/// The 25 bits or more from each of 16 bits on.
+#[inline(always)]
+unsafe fn words_at(packed: *const u8, bit: __m512i) -> __m512i {
+    // SAFETY: the caller may read 64 bytes
+    unsafe {
+        let bytes = _mm512_loadu_si512(packed.cast());
         let byte = _mm512_mullo_epi32(_mm512_srli_epi32::<3>(bit), _mm512_set1_epi32(0x0101_0101));
         let words = _mm512_permutexvar_epi8(_mm512_add_epi32(byte, _mm512_set1_epi32(0x0302_0100)), bytes);
-        let aligned = _mm512_srlv_epi32(words, _mm512_and_si512(bit, _mm512_set1_epi32(7)));
-        _mm512_and_si512(aligned, _mm512_set1_epi32((1 << bits) - 1))
+        _mm512_srlv_epi32(words, _mm512_and_si512(bit, _mm512_set1_epi32(7)))
     }
 }
 

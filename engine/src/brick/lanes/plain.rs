@@ -112,10 +112,12 @@ impl Lanes for Plain {
     #[inline(always)]
     unsafe fn corners(leaf: &[u8], layout: &Layout, reference: IVec3, out: &mut Corners) {
         let mut vertices = [[0_i32; VERTICES_MAX]; 3];
-        for vertex in 0..layout.vertices {
-            let position = layout.vertex(leaf, vertex);
-            for axis in 0..3 {
-                vertices[axis][vertex] = position[axis].wrapping_sub(reference[axis]);
+        for axis in 0..3 {
+            let mut packed = [0; VERTICES_MAX];
+            layout.unpack(leaf, axis, &mut packed);
+            let base = layout.origin[axis].wrapping_sub(reference[axis]);
+            for (vertex, packed) in vertices[axis].iter_mut().zip(packed) {
+                *vertex = base.wrapping_add((packed << layout.shift) as i32);
             }
         }
         if layout.kind == Kind::Triangles {

@@ -7,11 +7,15 @@
 //!                                   13-27   bits of a vertex coordinate, 5 per axis, 0 to 30
 //!                                   28-29   kind: 0 quads, 1 triangles, 2 round, 3 tile
 //!                                   30      extinctions follow
-//!                                   31      triangles only: eight more faces
-//!      4  indices      the corners of the faces: all first ones, then all second ones, ... each column
+//!                                   31      triangles: eight more faces; quads: in rows; tile: predicted
+//!         stride       u8       quads in rows: vertices from one row to the next
+//!         rest bits    u16      predicted tile: bits of a coordinate that is no corner's, 5 per axis, 0 to 30
+//!         indices      the corners of the faces: all first ones, then all second ones, ... each column
 //!                      ceil(faces * b / 8) bytes, b = 4 bits an index, or 5 for more than 16 vertices;
-//!                      four columns for quads, three for triangles, two for round faces, none in a tile
-//!         coordinates  per axis ceil(vertices * bits / 8) bytes, least significant bit first
+//!                      four columns for quads, three for triangles, two for round faces, one for quads in rows,
+//!                      none in a tile
+//!         coordinates  per axis ceil(vertices * bits / 8) bytes, least significant bit first; in a predicted
+//!                      tile those of the four corners, then the others' with their own bits, together padded to a byte
 //!         extinctions  u16 per face, if flagged
 //!         radii        f32 per vertex in lattice steps, round leaves only
 //! ```
@@ -19,16 +23,21 @@
 //! A coordinate is `((corner >> shift) + packed) << shift`, where `corner` is the lower corner of the child's decoded box:
 //! a leaf cannot be read without the node that refers to it. A leaf of quads may hold triangles, which repeat their last
 //! index; round leaves hold points (spheres), which repeat their only one, and lines (round cones). A tile is a piece of a
-//! regular grid, faces and vertices in rows.
+//! regular grid, faces and vertices in rows. Quads in rows have the vertices `i`, `i + 1`, `i + stride + 1` and `i + stride`, `i` being the index that is stored.
+//! What is stored of a predicted tile's vertices between its corners is the signed difference from [what is
+//! expected](predict).
 
+mod contents;
 mod encode;
 mod layout;
+pub mod predict;
 #[cfg(test)]
 mod tests;
 
 use glam::IVec3;
 
-pub use encode::{encode, encode_tile, rebase};
+pub use contents::{Contents, Gathered};
+pub use encode::encode;
 pub use layout::{Kind, Layout};
 
 use super::node::LatticeBox;
@@ -85,9 +94,14 @@ impl Face {
 
     /// Its box, radius included.
     pub fn bounds(&self) -> LatticeBox {
+        if !self.is_round() {
+            // Unused vertices repeat the last
+            let [a, b, c, d] = self.vertices;
+            return LatticeBox { min: a.min(b).min(c.min(d)), max: a.max(b).max(c.max(d)) };
+        }
         let mut bounds = LatticeBox::EMPTY;
-        for (i, &vertex) in self.vertices[..usize::from(self.arity)].iter().enumerate() {
-            let radius = if self.is_round() { self.radii[i].ceil() as i32 } else { 0 };
+        for (&vertex, radius) in self.vertices[..usize::from(self.arity)].iter().zip(self.radii) {
+            let radius = radius.ceil() as i32;
             bounds.add(vertex - radius);
             bounds.add(vertex + radius);
         }

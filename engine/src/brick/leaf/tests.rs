@@ -57,9 +57,9 @@ fn leaves_round_trip() {
         encode(&faces, shift, corner, &mut bytes);
         assert_eq!(decode(&mut bytes, corner), faces, "case {case}");
         let lower = corner - IVec3::new(1, 13, case as i32 % 50);
-        let mut rebased = Vec::new();
-        rebase(&bytes, corner, lower, &mut rebased);
-        assert_eq!(decode(&mut rebased, lower), faces, "rebased, case {case}");
+        let mut lower_bytes = Vec::new();
+        encode(&faces, shift, lower, &mut lower_bytes);
+        assert_eq!(decode(&mut lower_bytes, lower), faces, "from a lower corner, case {case}");
     }
 }
 
@@ -82,28 +82,67 @@ fn sixteen_triangles_fit() {
     assert_eq!(decode(&mut bytes, corner), faces);
 }
 
-/// Catches a tile that decodes to other faces than the same faces with indices.
+/// The faces of rows of quads over vertices in rows of `wide`, from vertex `first` on.
+fn rows(vertices: &[IVec3], first: usize, [columns, rows, wide]: [usize; 3]) -> Vec<Face> {
+    let at = |i: usize| vertices[i];
+    let firsts = (0..columns * rows).map(|face| first + face / columns * wide + face % columns);
+    let face = |a: usize| Face {
+        vertices: [at(a), at(a + 1), at(a + wide + 1), at(a + wide)],
+        arity: 4,
+        extinction: 1000 + a as u16,
+        radii: [0.0; 2],
+    };
+    firsts.map(face).collect()
+}
+
+/// Catches a tile that decodes to other faces than the same faces with indices, predicted or not, and one that is not
+/// predicted though it is smooth.
 #[test]
 fn tiles_equal_their_faces() {
-    for (columns, rows) in [(4, 2), (2, 4), (8, 1), (1, 8), (3, 2), (1, 1)] {
-        let wide = columns + 1;
-        let vertices: Vec<IVec3> =
-            (0..wide * (rows + 1)).map(|i| IVec3::new(i % wide, i / wide, i * i % 7) * 40).collect();
-        let at = |i: i32| vertices[i as usize];
-        let faces: Vec<Face> = (0..columns * rows)
-            .map(|face| face + face / columns)
-            .map(|a| Face {
-                vertices: [at(a), at(a + 1), at(a + wide + 1), at(a + wide)],
-                arity: 4,
-                extinction: 1000 + a as u16,
-                radii: [0.0; 2],
-            })
-            .collect();
-        let extinctions: Vec<u16> = faces.iter().map(|face| face.extinction).collect();
-        let corner = IVec3::new(-3, 0, -11);
+    for (columns, height) in [(4, 2), (2, 4), (8, 1), (1, 8), (3, 2), (1, 1), (7, 1)] {
+        for roughness in [7, 200, 1 << 20] {
+            let wide = columns + 1;
+            let bend = |i: usize| (hash32(i as u32) % roughness) as i32;
+            let vertices: Vec<IVec3> = (0..wide * (height + 1))
+                .map(|i| IVec3::new((i % wide) as i32 * 300, (i / wide) as i32 * 290, 0) + bend(i) * 8)
+                .map(|vertex| vertex / 8 * 8)
+                .collect();
+            let faces = rows(&vertices, 0, [columns, height, wide]);
+            let extinctions: Vec<u16> = faces.iter().map(|face| face.extinction).collect();
+            let corner = IVec3::new(-3, 0, -11);
+            let mut bytes = Vec::new();
+            let tile = Contents {
+                kind: Kind::Tile,
+                faces: faces.len(),
+                stride: wide,
+                shift: 3,
+                vertices: &vertices,
+                indices: &[],
+                extinctions: &extinctions,
+                radii: &[],
+            };
+            tile.encode(corner, &mut bytes);
+            assert_eq!(decode(&mut bytes, corner), faces, "{columns} {height} {roughness}");
+            let is_smooth = roughness == 7 && (9..=16).contains(&vertices.len());
+            assert!(!is_smooth || bytes[3] & 0x80 != 0, "{columns} {height} is not predicted");
+        }
+    }
+}
+
+/// Catches short strips that store an index for every corner, or that decode to other faces.
+#[test]
+fn strips_are_stored_in_rows() {
+    let random = |i: u32| IVec3::from_array([0, 1, 2].map(|axis| (hash32(3 * i + axis) % 5000) as i32));
+    let vertices: Vec<IVec3> = (0..40).map(random).collect();
+    let two_strips = [rows(&vertices, 0, [1, 4, 2]), rows(&vertices, 20, [1, 4, 2])].concat();
+    let patches = [rows(&vertices, 0, [2, 2, 3]), rows(&vertices, 9, [2, 2, 3])].concat();
+    let last_is_missing = rows(&vertices, 0, [2, 3, 3])[..5].to_vec();
+    let fan: Vec<Face> = (0..4).map(|i| rows(&vertices, 7 * i, [1, 1, 2])[0]).collect();
+    for (faces, in_rows) in [(two_strips, true), (patches, true), (last_is_missing, true), (fan, false)] {
         let mut bytes = Vec::new();
-        encode_tile(&vertices, columns as usize, &extinctions, 3, corner, &mut bytes);
-        assert_eq!(decode(&mut bytes, corner), faces);
+        encode(&faces, 0, IVec3::ZERO, &mut bytes);
+        assert_eq!(bytes[3] & 0x80 != 0, in_rows);
+        assert_eq!(decode(&mut bytes, IVec3::ZERO), faces);
     }
 }
 
@@ -119,7 +158,9 @@ fn impossible_leaves_are_refused() {
     assert!(read(tile(2, 4)) && read(tile(8, 1)) && !read(tile(3, 3)) && !read(tile(1, 9)));
     assert!(read(30 << 13) && !read(31 << 13), "bits of a coordinate");
     assert!(read(20 << 8) && !read(21 << 8), "shift");
-    assert!(read(1 << 28 | 1 << 31) && !read(1 << 31), "more than eight faces");
+    assert!(read(1 << 28 | 1 << 31), "more than eight faces");
+    assert!(!read(1 << 31), "rows without a stride");
+    assert!(read(tile(2, 3) | 1 << 31) && !read(tile(8, 1) | 1 << 31), "vertices of a predicted tile");
 }
 
 /// Catches extinction that does not multiply as opacity does.

@@ -75,6 +75,33 @@ impl Kernel for Avx512 {
     }
 
     #[inline(always)]
+    unsafe fn corners(
+        shape: &Shape,
+        blocks: [&[[i32; BLOCK]; 3]; 2],
+        reference: [i32; 3],
+        out: &mut [[[f32; TRIANGLES]; 3]; 3],
+    ) {
+        // SAFETY: the caller vouches for the instruction set; loads and stores are of whole arrays
+        unsafe {
+            let lanes = [
+                corner_lanes(&shape.corners[0]),
+                corner_lanes(&shape.corners[1]),
+                corner_lanes(&shape.corners[2]),
+            ];
+            for axis in 0..3 {
+                let base = _mm512_set1_epi32(reference[axis]);
+                let first = _mm512_sub_epi32(_mm512_loadu_si512(blocks[0][axis].as_ptr().cast()), base);
+                let second = _mm512_sub_epi32(_mm512_loadu_si512(blocks[1][axis].as_ptr().cast()), base);
+                let (first, second) = (_mm512_cvtepi32_ps(first), _mm512_cvtepi32_ps(second));
+                for corner in 0..3 {
+                    let gathered = _mm512_permutex2var_ps(first, lanes[corner], second);
+                    _mm512_storeu_ps(out[corner][axis].as_mut_ptr(), gathered);
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
     unsafe fn meet_leaf<const CLIP: bool>(
         shape: &Shape,
         blocks: [&[[i32; BLOCK]; 3]; 2],

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::super::bvh::{WideChild, WideNode};
 use super::fit;
-use super::kernel::{Kernel, slab};
+use super::kernel::{Boxes, Kernel, slab};
 use super::lines::{Column, Directions, LINES_MAX, Lines};
 use super::moments::Moments;
 use super::shapes::Shapes;
@@ -95,8 +95,12 @@ pub unsafe fn fill<K: Kernel>(
     others: Others<'_>,
 ) -> (Vec<[Record; WIDTH]>, Root) {
     let grove = Grove { tree, nodes, shapes };
-    let leaf_moments: Vec<Moments> =
-        (0..shapes.len() as u32).map(|leaf| Moments::of(shapes, shapes.shape(leaf))).collect();
+    // A loop, since an iterator's would not have the instruction set
+    let mut leaf_moments = Vec::with_capacity(shapes.len());
+    for leaf in 0..shapes.len() as u32 {
+        // SAFETY: the caller's
+        leaf_moments.push(unsafe { Moments::of::<K>(shapes, shapes.shape(leaf)) });
+    }
     let mut filler = Filler {
         grove,
         others,
@@ -286,17 +290,9 @@ impl Filler<'_> {
         if count < JUDGES_MIN {
             return Verdict { record, heritage: none };
         }
-        let mut others = Hits::NONE;
         let mut missing = judges & !hits.met;
-        for i in neighbours {
-            if missing == 0 {
-                break;
-            }
-            let target = self.neighbours[i].target;
-            // SAFETY: the caller's
-            unsafe { self.shooter.shoot::<K, true>(self.grove, target, &self.lines, missing, &mut others) };
-            missing &= !others.met;
-        }
+        // SAFETY: the caller's
+        missing &= !unsafe { self.met_beside::<K>(neighbours, missing) };
         let unknown = self.unknown(missing, bounds);
         let (known, missing) =
             ((judges & !unknown).count_ones() as f32, (missing & !unknown).count_ones() as f32);
@@ -311,6 +307,34 @@ impl Filler<'_> {
         }
         let is_blocked = blocked >= BLOCKED_MIN && blocked - own > BLOCKED_BY_OTHERS_MAX;
         Verdict { record: if is_blocked { far::marked(record) } else { record }, heritage }
+    }
+
+    /// The lines of `missing` that meet one of the neighbours where hits count.
+    #[inline(always)]
+    unsafe fn met_beside<K: Kernel>(&mut self, neighbours: std::ops::Range<usize>, mut missing: u64) -> u64 {
+        let (mut others, mut boxes, mut near) = (Hits::NONE, Boxes::default(), [0; WIDTH]);
+        let mut first = neighbours.start;
+        while first < neighbours.end && missing != 0 {
+            // Most neighbours touch a corner only, which few lines pass
+            let count = WIDTH.min(neighbours.end - first);
+            for slot in 0..count {
+                boxes.put(slot, &self.neighbours[first + slot].bounds, &self.lines);
+            }
+            // SAFETY: the caller's
+            unsafe { K::meet_boxes::<true>(&boxes, &self.lines, missing, &mut near) };
+            for slot in 0..count {
+                let (target, mask) = (self.neighbours[first + slot].target, near[slot] & missing);
+                if mask != 0 {
+                    // SAFETY: the caller's
+                    unsafe {
+                        self.shooter.shoot::<K, true>(self.grove, target, &self.lines, mask, &mut others)
+                    };
+                    missing &= !others.met;
+                }
+            }
+            first += count;
+        }
+        others.met
     }
 
     /// The lines of `missing` that pass the plate where other partitions have geometry.
@@ -407,7 +431,8 @@ impl Filler<'_> {
                         special.radii.iter().fold(0.0, |largest: f32, &radius| largest.max(radius))
                             * normal.length()
                     });
-                    for block in [shapes.block(shape), shapes.second_block(shape)] {
+                    let blocks = [shapes.block(shape), shapes.second_block(shape)];
+                    for block in &blocks[..1 + usize::from(shape.is_large)] {
                         for lane in 0..16 {
                             let at = |axis: usize| block[axis][lane].wrapping_sub(corner[axis]) as f32;
                             let along = (normal.x * at(0) + normal.y * at(1)) + normal.z * at(2);

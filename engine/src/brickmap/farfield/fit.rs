@@ -38,14 +38,17 @@ pub fn sum(count: usize, f: impl Fn(usize) -> f32) -> f32 {
             parts[lane] += f(LANES * chunk + lane);
         }
     }
-    let mut width = LANES / 2;
-    while width > 0 {
-        for lane in 0..width {
-            parts[lane] += parts[lane + width];
-        }
-        width /= 2;
+    // Halves, of lengths that are known
+    for lane in 0..8 {
+        parts[lane] += parts[lane + 8];
     }
-    parts[0]
+    for lane in 0..4 {
+        parts[lane] += parts[lane + 4];
+    }
+    for lane in 0..2 {
+        parts[lane] += parts[lane + 2];
+    }
+    parts[0] + parts[1]
 }
 
 #[inline(always)]

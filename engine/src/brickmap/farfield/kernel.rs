@@ -6,6 +6,7 @@ use glam::IVec3;
 
 use super::lines::{LINES_MAX, Lines};
 use super::shapes::{BLOCK, Shape, TRIANGLES};
+use crate::brick::LatticeBox;
 use crate::brick::node::{Node, WIDTH};
 
 /// Boxes of a node's children relative to the lines' center, in lattice steps.
@@ -16,6 +17,21 @@ pub struct Boxes {
     pub center: [[f32; WIDTH]; 3],
     /// Half extents, padded against rounding, per axis.
     pub half: [[f32; WIDTH]; 3],
+}
+
+impl Boxes {
+    /// Puts a box into a slot.
+    #[inline(always)]
+    pub fn put(&mut self, slot: usize, bounds: &LatticeBox, lines: &Lines<'_>) {
+        for axis in 0..3 {
+            let low = bounds.min[axis].wrapping_sub(lines.center[axis]) as f32;
+            let high = bounds.max[axis].wrapping_sub(lines.center[axis]) as f32;
+            let (center, half) = ((low + high) * 0.5, (high - low) * 0.5);
+            let reach = lines.half[axis] + lines.half[axis];
+            self.center[axis][slot] = center;
+            self.half[axis][slot] = ((center.abs() + half) + reach).mul_add(BOX_ERROR, half);
+        }
+    }
 }
 
 /// Relative error of box arithmetic: a few roundings of 2^-24.
@@ -41,6 +57,17 @@ pub trait Kernel {
         lines: &Lines<'_>,
         mask: u64,
         out: &mut [u64; WIDTH],
+    );
+
+    /// The corners of a leaf's triangles relative to `reference`: corner, axis, lane. Lanes without a triangle have no meaning.
+    ///
+    /// # Safety
+    /// See the trait.
+    unsafe fn corners(
+        shape: &Shape,
+        blocks: [&[[i32; BLOCK]; 3]; 2],
+        reference: [i32; 3],
+        out: &mut [[[f32; TRIANGLES]; 3]; 3],
     );
 
     /// The lines of `mask` that meet a triangle of the leaf, and for each of these which triangles, one bit a lane.
@@ -71,6 +98,24 @@ fn max(a: f32, b: f32) -> f32 {
 }
 
 impl Kernel for Plain {
+    #[inline(always)]
+    unsafe fn corners(
+        shape: &Shape,
+        blocks: [&[[i32; BLOCK]; 3]; 2],
+        reference: [i32; 3],
+        out: &mut [[[f32; TRIANGLES]; 3]; 3],
+    ) {
+        for corner in 0..3 {
+            for axis in 0..3 {
+                for lane in 0..TRIANGLES {
+                    let vertex = usize::from(shape.corners[corner][lane]);
+                    let position = blocks[vertex / BLOCK % 2][axis][vertex % BLOCK];
+                    out[corner][axis][lane] = position.wrapping_sub(reference[axis]) as f32;
+                }
+            }
+        }
+    }
+
     #[inline(always)]
     unsafe fn boxes(node: &Node, lines: &Lines<'_>, out: &mut Boxes) {
         for axis in 0..3 {

@@ -6,6 +6,7 @@
 use glam::{Mat3, Vec3};
 use serde::{Deserialize, Serialize};
 
+use super::kernel::Kernel;
 use super::opacity;
 use super::shapes::{Shape, Shapes, TRIANGLES};
 use crate::brick::leaf::{FACES_MAX, Kind};
@@ -30,10 +31,14 @@ impl Moments {
     }
 
     /// The sums of a leaf.
+    ///
+    /// # Safety
+    /// The instruction set of `K` is available.
     #[inline(always)]
-    pub fn of(shapes: &Shapes, shape: &Shape) -> Self {
+    pub unsafe fn of<K: Kernel>(shapes: &Shapes, shape: &Shape) -> Self {
         match shapes.special(shape) {
-            None => Self::of_triangles(shapes, shape, [1.0; TRIANGLES]),
+            // SAFETY: the caller's
+            None => unsafe { Self::of_triangles::<K>(shapes, shape, [1.0; TRIANGLES]) },
             Some(special) => {
                 let weights = special.extinctions.map(opacity);
                 let mut sums = if shape.kind == Kind::Round {
@@ -43,7 +48,8 @@ impl Moments {
                     if shape.kind != Kind::Triangles {
                         lanes.copy_within(..FACES_MAX, FACES_MAX);
                     }
-                    Self::of_triangles(shapes, shape, lanes)
+                    // SAFETY: the caller's
+                    unsafe { Self::of_triangles::<K>(shapes, shape, lanes) }
                 };
                 sums.is_transparent = weights[..usize::from(shape.faces)].iter().any(|&weight| weight < 1.0);
                 sums
@@ -52,19 +58,12 @@ impl Moments {
     }
 
     #[inline(always)]
-    fn of_triangles(shapes: &Shapes, shape: &Shape, weights: [f32; TRIANGLES]) -> Self {
+    unsafe fn of_triangles<K: Kernel>(shapes: &Shapes, shape: &Shape, weights: [f32; TRIANGLES]) -> Self {
         let blocks = [shapes.block(shape), shapes.second_block(shape)];
         let reference = [0, 1, 2].map(|axis| blocks[0][axis][0]);
         let mut corners = [[[0.0_f32; TRIANGLES]; 3]; 3];
-        for corner in 0..3 {
-            for axis in 0..3 {
-                for lane in 0..TRIANGLES {
-                    let vertex = usize::from(shape.corners[corner][lane]);
-                    let position = blocks[vertex / 16 % 2][axis][vertex % 16];
-                    corners[corner][axis][lane] = position.wrapping_sub(reference[axis]) as f32;
-                }
-            }
-        }
+        // SAFETY: the caller's
+        unsafe { K::corners(shape, blocks, reference, &mut corners) };
         let [a, b, c] = &corners;
         let mut terms = [[0.0_f32; TRIANGLES]; 7];
         for lane in 0..TRIANGLES {

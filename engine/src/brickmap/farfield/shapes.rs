@@ -2,7 +2,7 @@
 
 use glam::IVec3;
 
-use crate::brick::leaf::{FACES_MAX, Kind, Layout, TRIANGLES_MAX, VERTICES_MAX};
+use crate::brick::leaf::{Contents, FACES_MAX, Kind, OPAQUE, TRIANGLES_MAX, VERTICES_MAX};
 
 /// Triangles of a leaf: two a face, or one.
 pub const TRIANGLES: usize = TRIANGLES_MAX;
@@ -47,49 +47,41 @@ pub struct Shapes {
 }
 
 impl Shapes {
-    /// Adds a leaf. `leaf` runs on past its end by 8 bytes.
-    pub fn push(&mut self, leaf: &[u8], layout: &Layout) {
-        let is_large = layout.vertices > BLOCK;
+    /// Adds a leaf.
+    pub fn push(&mut self, leaf: &Contents<'_>) {
+        let is_large = leaf.vertices.len() > BLOCK;
         let first = self.blocks.len() as u32;
-        let mut vertices = [[0; VERTICES_MAX]; 3];
-        for vertex in 0..layout.vertices {
-            let position = layout.vertex(leaf, vertex);
-            (0..3).for_each(|axis| vertices[axis][vertex] = position[axis]);
-        }
-        // Unused lanes repeat a vertex, so that ranges over lanes are ranges over vertices
-        for column in &mut vertices {
-            let last = column[layout.vertices - 1];
-            column[layout.vertices..].fill(last);
-        }
-        for block in 0..1 + usize::from(is_large) {
-            let lanes = BLOCK * block..BLOCK * (block + 1);
-            self.blocks.push([0, 1, 2].map(|axis| std::array::from_fn(|i| vertices[axis][lanes.start + i])));
+        for part in leaf.vertices.chunks(BLOCK) {
+            // Unused lanes repeat a vertex, so that ranges over lanes are ranges over vertices
+            let mut block = [[0; BLOCK]; 3];
+            for lane in 0..BLOCK {
+                let vertex = part[lane.min(part.len() - 1)];
+                (0..3).for_each(|axis| block[axis][lane] = vertex[axis]);
+            }
+            self.blocks.push(block);
         }
 
         let mut corners = [[0; TRIANGLES]; 3];
-        let corner_count = if layout.kind == Kind::Tile { 4 } else { layout.kind.corners() };
-        for face in 0..layout.faces {
-            let [a, b, c, d] = [0, 1, 2, 3].map(|c| layout.index(leaf, face, c.min(corner_count - 1)) as u8);
+        for face in 0..leaf.faces {
+            let [a, b, c, d] = [0, 1, 2, 3].map(|corner| leaf.index(face, corner) as u8);
             for (corner, (lower, upper)) in corners.iter_mut().zip([(a, a), (b, c), (c, d)]) {
                 corner[face] = lower;
-                if layout.kind != Kind::Triangles {
+                if leaf.kind != Kind::Triangles {
                     corner[face + FACES_MAX] = upper;
                 }
             }
         }
-        let present = ((1_u32 << layout.faces) - 1) as u16;
-        let present = if layout.kind == Kind::Triangles { present } else { present | present << FACES_MAX };
-        let is_round = layout.kind == Kind::Round;
-        let special = (is_round || !layout.opaque).then(|| {
-            let mut special = Special { radii: [0.0; VERTICES_MAX], extinctions: [0; TRIANGLES] };
-            if is_round {
-                (0..layout.vertices).for_each(|v| special.radii[v] = layout.radius(leaf, v));
-            }
-            (0..layout.faces).for_each(|face| special.extinctions[face] = layout.extinction(leaf, face));
+        let present = ((1_u32 << leaf.faces) - 1) as u16;
+        let present = if leaf.kind == Kind::Triangles { present } else { present | present << FACES_MAX };
+        let special = (leaf.kind == Kind::Round || !leaf.extinctions.is_empty()).then(|| {
+            let mut special = Special { radii: [0.0; VERTICES_MAX], extinctions: [OPAQUE; TRIANGLES] };
+            special.extinctions[leaf.faces..].fill(0);
+            special.radii[..leaf.radii.len()].copy_from_slice(leaf.radii);
+            special.extinctions[..leaf.extinctions.len()].copy_from_slice(leaf.extinctions);
             self.special.push(special);
             self.special.len() as u32 - 1
         });
-        let (kind, faces) = (layout.kind, layout.faces as u8);
+        let (kind, faces) = (leaf.kind, leaf.faces as u8);
         self.shapes.push(Shape { first, special, is_large, kind, faces, present, corners });
     }
 

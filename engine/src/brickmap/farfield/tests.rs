@@ -9,11 +9,11 @@ use super::{Others, Root, directional, lost};
 use crate::brick::far::{self, Kind, Record, transmittance};
 use crate::brick::intersect;
 use crate::brick::lanes::InstructionSet;
-use crate::brick::leaf::{Face, Layout, OPAQUE};
+use crate::brick::leaf::{Face, Layout, OPAQUE, READ_PAST_BYTES};
 use crate::brick::node::{LatticeBox, Node, WIDTH};
 use crate::brickmap::bvh::{self, WideChild, WideTree};
 use crate::brickmap::chunk::Chunk;
-use crate::brickmap::pack::{Content, Primitive};
+use crate::brickmap::pack::Primitive;
 use crate::brickmap::spill::Quantised;
 use crate::math::hash::{hash32, unit_f32};
 
@@ -51,12 +51,14 @@ impl Forest {
         };
         let nodes = tree.nodes.iter().map(over).collect();
         let (mut shapes, mut faces) = (Shapes::default(), Vec::new());
-        for Primitive { content, bounds, .. } in &chunk.clusters {
-            let Content::Leaf { offset, .. } = *content else { continue };
-            let leaf = &chunk.leaves[offset as usize..];
-            let layout = Layout::read_trusted(leaf, bounds.min);
-            shapes.push(leaf, &layout);
-            faces.extend((0..layout.faces).map(|face| layout.face(leaf, face)));
+        for (number, Primitive { bounds, .. }) in chunk.clusters.iter().enumerate() {
+            let contents = chunk.leaves.get(number);
+            shapes.push(&contents);
+            let mut leaf = Vec::new();
+            contents.encode(bounds.min, &mut leaf);
+            leaf.extend([0; READ_PAST_BYTES]);
+            let layout = Layout::read_trusted(&leaf, bounds.min);
+            faces.extend((0..layout.faces).map(|face| layout.face(&leaf, face)));
         }
         Self { tree, nodes, shapes, faces }
     }
