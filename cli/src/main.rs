@@ -73,6 +73,8 @@ enum Command {
     Workers(farm::jobs::WorkersArguments),
     Logs(farm::logs::Arguments),
     Fetch(farm::fetch::Arguments),
+    Delete(farm::gc::DeleteArguments),
+    Gc(farm::gc::Arguments),
     Serve(service::serve::Arguments),
     Sim(service::sim::Arguments),
     /// Make, list and revoke tokens
@@ -110,6 +112,8 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
         Command::Workers(arguments) => farm::jobs::run_workers(arguments, console),
         Command::Logs(arguments) => farm::logs::run(arguments, console),
         Command::Fetch(arguments) => farm::fetch::run(arguments, console),
+        Command::Delete(arguments) => farm::gc::run_delete(arguments, console),
+        Command::Gc(arguments) => farm::gc::run(arguments, console),
         Command::Serve(arguments) => service::serve::run(arguments),
         Command::Sim(arguments) => service::sim::run(&arguments, console),
         Command::Token(command) => service::token::run(command),

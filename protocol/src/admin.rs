@@ -116,7 +116,18 @@ pub struct Project {
     /// Its share of the farm, against those of others.
     pub share: i64,
     /// Batches that run at once at most, over all of its jobs.
+    #[serde(default)]
     pub running_max: Option<i64>,
+    /// Days after a job's end that its batches, parts and scene are kept.
+    #[serde(default = "default_retention_days")]
+    pub retention_days: i64,
+    /// Days after a job's end that what it published is kept; none stands for ever.
+    #[serde(default)]
+    pub outputs_days: Option<i64>,
+}
+
+fn default_retention_days() -> i64 {
+    14
 }
 
 /// A change, and who made it.
@@ -146,23 +157,6 @@ pub struct AuditPage {
     /// The cursor of the next page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<i64>,
-}
-
-/// What garbage collection removed, or would remove.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-pub struct GcReport {
-    /// Whether nothing was removed.
-    pub dry_run: bool,
-    /// Folders of jobs that are past their retention.
-    pub jobs: Vec<String>,
-    /// Parts that no manifest and no merge needs any more.
-    pub parts: u64,
-    /// Assets that no job refers to.
-    pub assets: u64,
-    /// Brick maps that no job refers to.
-    pub brick_maps: u64,
-    /// Bytes of all of these.
-    pub bytes: u64,
 }
 
 /// A browser signs in with a token.

@@ -5,6 +5,7 @@ use std::time::Duration;
 use protocol::admin::{
     EnrolRequest, MissingReply, MissingRequest, Project, Secret, TokenDetail, TokenRequest, WorkerDetail,
 };
+use protocol::gc::{DeletePreview, GcReport, GcRequest};
 use protocol::job::{
     BatchSelection, Changed, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary, Manifest,
     Submitted,
@@ -122,6 +123,16 @@ impl Client {
         self.get(&format!("/v1/jobs/{job}/manifest"))
     }
 
+    /// What would go with a job if it were deleted.
+    pub fn delete_preview(&self, job: &str) -> Result<DeletePreview> {
+        self.get(&format!("/v1/jobs/{job}/delete-preview"))
+    }
+
+    /// Deletes a job that has ended.
+    pub fn delete_job(&self, job: &str) -> Result<Value> {
+        self.delete(&format!("/v1/jobs/{job}"))
+    }
+
     /// The farm's workers.
     pub fn workers(&self) -> Result<Vec<WorkerDetail>> {
         self.get("/v1/workers")
@@ -131,6 +142,11 @@ impl Client {
 /// What administrators ask. Errors are those of [`Client::get`].
 #[expect(clippy::missing_errors_doc, reason = "said once, above")]
 impl Client {
+    /// Collects garbage for some seconds, or says what there is.
+    pub fn collect_garbage(&self, request: &GcRequest) -> Result<GcReport> {
+        self.post("/v1/gc", request, Duration::from_secs(20))
+    }
+
     /// Makes a token.
     pub fn create_token(&self, request: &TokenRequest) -> Result<Secret> {
         self.post("/v1/tokens", request, Duration::ZERO)

@@ -3,6 +3,7 @@
 pub mod control;
 pub mod fetch;
 mod files;
+pub mod gc;
 pub mod jobs;
 pub mod logs;
 pub mod submit;

@@ -13,6 +13,7 @@ use protocol::admin::{Secret, TokenRequest};
 use serde_json::json;
 use server::config::Settings;
 use server::coordinator::Coordinator;
+use server::db::retention::Retention;
 
 use super::embedded::{self, Crew};
 use super::{Place, block_on, write_secret};
@@ -54,6 +55,19 @@ pub struct Arguments {
     /// Bytes of one uploaded file at most
     #[arg(long, value_name = "SIZE", default_value = "1TiB", value_parser = crate::values::size)]
     upload_max: u64,
+    /// Days after a job's end that its logs are kept
+    #[arg(long, value_name = "DAYS", default_value_t = 30, value_parser = days())]
+    log_days: i64,
+    /// Days that events are kept
+    #[arg(long, value_name = "DAYS", default_value_t = 7, value_parser = days())]
+    event_days: i64,
+    /// Days that the audit is kept
+    #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = days())]
+    audit_days: i64,
+}
+
+fn days() -> clap::builder::RangedI64ValueParser {
+    clap::value_parser!(i64).range(1..=36_500)
 }
 
 /// Serves until SIGTERM or SIGINT.
@@ -77,6 +91,11 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         without_tokens: arguments.insecure_local,
         lease_ttl_ms: i64::from(arguments.lease) * 1_000,
         asset_bytes_max: arguments.upload_max,
+        retention: Retention {
+            log_days: arguments.log_days,
+            event_days: arguments.event_days,
+            audit_days: arguments.audit_days,
+        },
     };
     let (place, listen, count) = (arguments.place.clone(), arguments.listen, arguments.workers);
     let served = block_on(async move {

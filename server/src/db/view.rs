@@ -12,14 +12,18 @@ use crate::{Error, Result, values};
 pub(super) const SUMMARY: &str =
     "SELECT j.id, j.name, j.project, j.state, j.paused, j.reason, j.priority, j.submitted_by, j.shot,
     j.frame, j.comment, j.created_at, j.started_at, j.ended_at, j.version,
-    COALESCE(c.r, 0), COALESCE(c.l, 0), COALESCE(c.d, 0), COALESCE(c.f, 0), COALESCE(c.k, 0)";
+    COALESCE(c.r, 0), COALESCE(c.l, 0), COALESCE(c.d, 0), COALESCE(c.f, 0), COALESCE(c.k, 0), j.work_gone";
 
 /// The counts of the bake passes of the jobs in a list.
-pub(super) const COUNTS: &str = "LEFT JOIN (SELECT p.job_id AS job, CAST(SUM(s.n_ready) AS BIGINT) AS r,
-        CAST(SUM(s.n_leased) AS BIGINT) AS l, CAST(SUM(s.n_done) AS BIGINT) AS d,
-        CAST(SUM(s.n_failed) AS BIGINT) AS f, CAST(SUM(s.n_skipped) AS BIGINT) AS k
-    FROM pass p JOIN segment s ON s.pass_id = p.id WHERE p.kind = 3 AND p.job_id IN (SELECT id FROM page)
-    GROUP BY p.job_id) AS c ON c.job = j.id";
+pub(super) const COUNTS: &str = "LEFT JOIN (SELECT p.job_id AS job, CAST(SUM(COALESCE(s.r, 0)) AS BIGINT) AS r,
+        CAST(SUM(COALESCE(s.l, 0)) AS BIGINT) AS l, CAST(SUM(p.kept_done + COALESCE(s.d, 0)) AS BIGINT) AS d,
+        CAST(SUM(p.kept_failed + COALESCE(s.f, 0)) AS BIGINT) AS f,
+        CAST(SUM(p.kept_skipped + COALESCE(s.k, 0)) AS BIGINT) AS k
+    FROM pass p LEFT JOIN (SELECT pass_id, SUM(n_ready) AS r, SUM(n_leased) AS l, SUM(n_done) AS d, SUM(n_failed) AS f,
+            SUM(n_skipped) AS k
+        FROM segment WHERE pass_id IN (SELECT id FROM pass WHERE kind = 3 AND job_id IN (SELECT id FROM page))
+        GROUP BY pass_id) AS s ON s.pass_id = p.id
+    WHERE p.kind = 3 AND p.job_id IN (SELECT id FROM page) GROUP BY p.job_id) AS c ON c.job = j.id";
 
 pub(super) fn summary(row: &Row) -> Result<JobSummary> {
     Ok(JobSummary {
@@ -39,6 +43,7 @@ pub(super) fn summary(row: &Row) -> Result<JobSummary> {
         ended_at: row.int_or_null(13)?,
         version: row.int(14)?,
         batches: counts(row, 15)?,
+        pruned: row.flag(20)?,
     })
 }
 
@@ -59,7 +64,7 @@ impl Store {
     /// [`NotFound`](crate::error::Kind::NotFound).
     pub async fn job(&self, job: &str) -> Result<JobSummary> {
         let sql = format!(
-            "WITH page AS (SELECT id FROM job WHERE id = $1) {SUMMARY} FROM page JOIN job j ON j.id = page.id {COUNTS}"
+            "WITH page AS (SELECT id FROM job WHERE id = $1 AND deleted = 0) {SUMMARY} FROM page JOIN job j ON j.id = page.id {COUNTS}"
         );
         let row = self.query_one(sql, values![job]).await?;
         summary(&row.ok_or_else(|| Error::not_found("job", job))?)
@@ -81,11 +86,13 @@ impl Store {
     pub async fn pass_details(&self, job: &str) -> Result<Vec<PassDetail>> {
         let sql = "SELECT p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result,
                 CAST(COALESCE(SUM(s.n_ready), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_leased), 0) AS BIGINT),
-                CAST(COALESCE(SUM(s.n_done), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_failed), 0) AS BIGINT),
-                CAST(COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
+                CAST(p.kept_done + COALESCE(SUM(s.n_done), 0) AS BIGINT),
+                CAST(p.kept_failed + COALESCE(SUM(s.n_failed), 0) AS BIGINT),
+                CAST(p.kept_skipped + COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT)
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
-            GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result ORDER BY p.id";
+            GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result, p.kept_done, p.kept_failed,
+                p.kept_skipped ORDER BY p.id";
         let pass = |row: &Row| {
             Ok(PassDetail {
                 id: row.int(0)?,

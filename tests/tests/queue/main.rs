@@ -3,6 +3,7 @@
 mod access;
 mod bench;
 mod claims;
+mod garbage;
 mod graph;
 mod model;
 mod people;

@@ -115,7 +115,7 @@ fn see(people: &Client, job: &str, output: &protocol::job::Output, path: &Path) 
     }
 }
 
-fn wait_for(client: &Client, jobs: &[String]) {
+pub fn wait_for(client: &Client, jobs: &[String]) {
     // A minute and a half is many times what it takes
     for _ in 0..450 {
         let is_over = |job: &String| client.job(job).unwrap().summary.state.is_final();

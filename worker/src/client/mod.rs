@@ -140,6 +140,14 @@ impl Client {
         self.ask("PUT", path, Some(encode(body)?), &[], Duration::ZERO)
     }
 
+    /// DELETEs `path`.
+    ///
+    /// # Errors
+    /// As [`get`](Self::get).
+    pub fn delete<R: DeserializeOwned>(&self, path: &str) -> Result<R> {
+        self.ask("DELETE", path, None, &[], Duration::ZERO)
+    }
+
     /// A request whose answer is JSON, or empty, which reads as `null`.
     fn ask<R: DeserializeOwned>(
         &self,
