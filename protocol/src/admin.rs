@@ -118,16 +118,13 @@ pub struct Project {
     /// Batches that run at once at most, over all of its jobs.
     #[serde(default)]
     pub running_max: Option<i64>,
-    /// Days after a job's end that its batches, parts and scene are kept.
-    #[serde(default = "default_retention_days")]
-    pub retention_days: i64,
-    /// Days after a job's end that what it published is kept; none stands for ever.
+    /// Days after a job's end that its batches, parts and scene are kept: 14 unless something is said; a change that says
+    /// nothing leaves it as it is.
+    #[serde(default)]
+    pub retention_days: Option<i64>,
+    /// Days after a job's end that what it published is kept: for ever unless something is said; likewise.
     #[serde(default)]
     pub outputs_days: Option<i64>,
-}
-
-fn default_retention_days() -> i64 {
-    14
 }
 
 /// A change, and who made it.

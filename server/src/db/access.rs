@@ -186,7 +186,7 @@ impl Store {
                 name: row.text(0)?,
                 share: row.int(1)?,
                 running_max: row.int_or_null(2)?,
-                retention_days: row.int(3)?,
+                retention_days: row.int_or_null(3)?,
                 outputs_days: row.int_or_null(4)?,
             })
         };
@@ -200,8 +200,9 @@ impl Store {
     pub async fn put_project(&self, project: &Project) -> Result<()> {
         let mut tx = self.begin().await?;
         let sql = "INSERT INTO project (name, share, running_max, retention_days, outputs_days)
-            VALUES ($1, $2, $3, $4, $5)
-            ON CONFLICT (name) DO UPDATE SET share = $2, running_max = $3, retention_days = $4, outputs_days = $5";
+            VALUES ($1, $2, $3, COALESCE($4, 14), $5)
+            ON CONFLICT (name) DO UPDATE SET share = $2, running_max = $3,
+                retention_days = COALESCE($4, project.retention_days), outputs_days = COALESCE($5, project.outputs_days)";
         let Project { name, share, running_max, retention_days, outputs_days } = project;
         tx.execute(sql.into(), values![name, *share, *running_max, *retention_days, *outputs_days]).await?;
         self.commit("project", tx).await

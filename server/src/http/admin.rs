@@ -228,8 +228,10 @@ pub async fn put_project(
     confined(&caller)?;
     let possible = (1..=1_000_000).contains(&project.share)
         && project.running_max.is_none_or(|max| max >= 0)
-        && (0..=36_500).contains(&project.retention_days)
-        && project.outputs_days.is_none_or(|days| (0..=36_500).contains(&days));
+        && [project.retention_days, project.outputs_days]
+            .iter()
+            .flatten()
+            .all(|days| (0..=36_500).contains(days));
     if name != project.name || !limits::is_name(&name) || !possible {
         return Err(Error::invalid(
             "a project has the name of its path, a share from 1 to 1000000, `running_max` 0 or more, and days up to 36500",
