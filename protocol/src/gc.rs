@@ -65,6 +65,22 @@ pub enum GcKind {
 }
 
 impl GcKind {
+    /// All of them.
+    pub const ALL: [Self; 12] = [
+        Self::Attempt,
+        Self::Batch,
+        Self::Work,
+        Self::Log,
+        Self::Output,
+        Self::Job,
+        Self::BrickMap,
+        Self::Asset,
+        Self::Orphan,
+        Self::Event,
+        Self::Audit,
+        Self::Absent,
+    ];
+
     /// A word for metrics and tables.
     pub fn word(self) -> &'static str {
         match self {
