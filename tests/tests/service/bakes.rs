@@ -93,6 +93,7 @@ fn a_farm_bakes_what_one_process_bakes() {
         let kinds: Vec<&str> = all.iter().map(|(_, kind)| kind.as_str()).collect();
         assert_eq!(kinds, ["job.submitted", "job.running", "job.succeeded"]);
         assert_eq!(events(service, &jobs[0], all[1].0), all[2..]);
+        super::life::deployed_queries_are_answered(&people);
         service.runtime.block_on(async {
             assert_eq!(service.coordinator.store.drift().await.unwrap(), []);
             assert_eq!(service.coordinator.store.orphans().await.unwrap(), 0);
