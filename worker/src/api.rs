@@ -3,13 +3,15 @@
 use std::time::Duration;
 
 use protocol::admin::{
-    EnrolRequest, MissingReply, MissingRequest, Project, Secret, TokenDetail, TokenRequest, WorkerDetail,
+    AuditPage, EnrolRequest, MissingReply, MissingRequest, Project, Secret, TicketRequest, TokenDetail,
+    TokenRequest, WorkerDetail,
 };
 use protocol::gc::{DeletePreview, GcReport, GcRequest};
 use protocol::job::{
-    BatchSelection, Changed, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary, Manifest,
-    Submitted,
+    BatchSelection, Changed, Estimate, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary,
+    Manifest, ResubmitRequest, Submitted,
 };
+use protocol::overview::FarmDetail;
 use protocol::storage::{SceneFiles, UrlsReply, UrlsRequest};
 use protocol::work::{
     Claim, ClaimRequest, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest, LogRequest,
@@ -88,6 +90,16 @@ impl Client {
         self.post_once("/v1/jobs", request, key)
     }
 
+    /// Checks a submission, and says what it would ask of the farm.
+    pub fn validate(&self, request: &JobRequest) -> Result<Estimate> {
+        self.post("/v1/jobs/validate", request, Duration::ZERO)
+    }
+
+    /// Submits a job again, with edits; a repetition with the same `key` makes no second job.
+    pub fn resubmit(&self, job: &str, edits: &ResubmitRequest, key: &str) -> Result<Submitted> {
+        self.post_once(&format!("/v1/jobs/{job}/resubmit"), edits, key)
+    }
+
     /// A page of jobs, latest first. `query` goes as it is.
     pub fn jobs(&self, query: &str) -> Result<JobPage> {
         self.get(&format!("/v1/jobs{query}"))
@@ -137,6 +149,16 @@ impl Client {
     pub fn workers(&self) -> Result<Vec<WorkerDetail>> {
         self.get("/v1/workers")
     }
+
+    /// The farm at a glance.
+    pub fn farm(&self) -> Result<FarmDetail> {
+        self.get("/v1/farm")
+    }
+
+    /// The projects that the caller may see.
+    pub fn projects(&self) -> Result<Vec<Project>> {
+        self.get("/v1/projects")
+    }
 }
 
 /// What administrators ask. Errors are those of [`Client::get`].
@@ -155,6 +177,21 @@ impl Client {
     /// All tokens, latest first.
     pub fn tokens(&self) -> Result<Vec<TokenDetail>> {
         self.get("/v1/tokens")
+    }
+
+    /// Locks, unlocks or drains a worker.
+    pub fn act_on_worker(&self, worker: &str, action: &str) -> Result<Value> {
+        self.post(&format!("/v1/workers/{worker}/{action}"), &json!({}), Duration::ZERO)
+    }
+
+    /// Makes a ticket, by which workers enrol.
+    pub fn create_ticket(&self, request: &TicketRequest) -> Result<Secret> {
+        self.post("/v1/tickets", request, Duration::ZERO)
+    }
+
+    /// A page of the audit, latest first. `query` goes as it is.
+    pub fn audit(&self, query: &str) -> Result<AuditPage> {
+        self.get(&format!("/v1/audit{query}"))
     }
 
     /// Makes a project, or changes its share.

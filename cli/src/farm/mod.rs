@@ -1,5 +1,6 @@
 //! The farm's commands: how a coordinator is reached, and what several of them need.
 
+pub mod admin;
 pub mod control;
 pub mod fetch;
 mod files;

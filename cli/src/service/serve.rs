@@ -17,7 +17,7 @@ use server::db::retention::Retention;
 
 use super::embedded::{self, Crew};
 use super::{Place, block_on, write_secret};
-use crate::console::Answer;
+use crate::console::{Answer, LogFormat};
 use crate::signals;
 
 /// How long the token of embedded workers holds; it is revoked when their process ends in peace.
@@ -71,7 +71,7 @@ fn days() -> clap::builder::RangedI64ValueParser {
 }
 
 /// Serves until SIGTERM or SIGINT.
-pub fn run(arguments: Arguments) -> Result<Answer> {
+pub fn run(arguments: Arguments, log_format: LogFormat) -> Result<Answer> {
     let loopback = |ip: IpAddr| ip.is_loopback();
     if arguments.insecure_local && !loopback(arguments.listen.ip()) {
         let message = format!("`{}` can be reached from elsewhere", arguments.listen);
@@ -105,9 +105,9 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         })?;
         let listen = listener.local_addr()?;
         if !coordinator.settings.without_tokens && !coordinator.store.has_tokens().await? {
-            first_token(&coordinator, &place).await?;
+            first_token(&coordinator, &place, log_format).await?;
         }
-        eprintln!("listening at http://{listen}");
+        log_format.tell(&format!("listening at http://{listen}"));
         let token = if count > 0 { worker_token(&coordinator).await? } else { None };
         let stop = until_done(coordinator.clone(), count, token, listen, place.data.join("workers"));
         server::http::serve(coordinator, listener, stop).await?;
@@ -123,13 +123,13 @@ fn option(text: &str) -> Result<(String, String), String> {
 }
 
 /// A database without tokens gets one, for its administrator.
-async fn first_token(coordinator: &Coordinator, place: &Place) -> server::Result<()> {
+async fn first_token(coordinator: &Coordinator, place: &Place, log_format: LogFormat) -> server::Result<()> {
     let (project, expires_s) = (None, None);
     let request = TokenRequest { role: Role::Admin, project, label: "first".into(), expires_s };
     let made = server::http::make_token(&coordinator.store, &request, coordinator.now()).await?;
     let path = place.data.join("admin.token");
     write_secret(&path, &made.secret)?;
-    eprintln!("an administrator's token is in {}", path.display());
+    log_format.tell(&format!("an administrator's token is in {}", path.display()));
     Ok(())
 }
 
@@ -157,12 +157,12 @@ async fn until_done(
     until_stopped().await;
     match workers {
         Ok(workers) => drop(tokio::task::spawn_blocking(move || embedded::join(workers)).await),
-        Err(error) => eprintln!("no embedded workers: {error}"),
+        Err(error) => tracing::error!("no embedded workers: {error}"),
     }
     if let Some(token) = token
         && let Err(error) = coordinator.store.revoke_token(&token.id, coordinator.now()).await
     {
-        eprintln!("the token of the embedded workers is not revoked: {error}");
+        tracing::error!("the token of the embedded workers is not revoked: {error}");
     }
 }
 

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use protocol::keys;
 use protocol::limits::{self, CLAIM_MAX};
 use protocol::work::{
-    Claim, ClaimRequest, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest, PROTOCOL_VERSION,
-    RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
+    Claim, ClaimRequest, CompleteItem, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest,
+    Outcome, PROTOCOL_VERSION, RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
 };
 
 use super::{Coordinator, lock};
@@ -246,6 +246,7 @@ impl Coordinator {
         };
         let items = self.verified(request).await?;
         let completion = self.store.complete(&reporter, &items).await?;
+        log(&completion, &session.worker, request.pass, &items);
         self.settled(&completion);
         metrics::histogram!("pantaray_complete_seconds").record(start.elapsed().as_secs_f64());
         for verdict in &completion.verdicts {
@@ -303,6 +304,22 @@ impl Coordinator {
     }
 }
 
+/// Logs what became of batches: failures for everybody, all of it for who wants to know.
+fn log(completion: &Completion, worker: &str, pass: i64, items: &[CompleteItem]) {
+    let job = completion.job.as_str();
+    for (item, verdict) in items.iter().zip(&completion.verdicts) {
+        let (batch, fence) = (item.batch, item.fence);
+        match &item.outcome {
+            Outcome::Failed { class, message, .. } => {
+                tracing::warn!(job, pass, batch, fence, worker, %class, ?verdict, "a batch failed: {message}");
+            }
+            Outcome::Done { .. } => {
+                tracing::debug!(job, pass, batch, fence, worker, ?verdict, "a batch is done");
+            }
+        }
+    }
+}
+
 /// Counts a claim among those that wait for as long as it lives.
 struct Waiting<'a>(&'a Coordinator);
 
@@ -313,7 +330,6 @@ impl Drop for Waiting<'_> {
 }
 
 fn check_items(request: &CompleteRequest) -> Result<()> {
-    use protocol::work::Outcome;
     if request.items.is_empty() || request.items.len() as i64 > CLAIM_MAX {
         return Err(Error::invalid(format!(
             "`{}` results, 1 to {CLAIM_MAX} are possible",

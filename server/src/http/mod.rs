@@ -14,6 +14,7 @@ mod overview;
 mod session;
 #[cfg(test)]
 mod tests;
+mod trace;
 mod work;
 
 use std::collections::BTreeMap;
@@ -176,6 +177,7 @@ pub fn router(coordinator: Arc<Coordinator>) -> Router {
         .route_layer(middleware::from_fn_with_state(api.clone(), guard))
         .merge(crate::dashboard::router())
         .layer(DefaultBodyLimit::max(limits::REQUEST_BYTES_MAX))
+        .layer(middleware::from_fn(trace::name))
         .fallback(unknown)
         .with_state(api)
 }

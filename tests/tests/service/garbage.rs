@@ -109,7 +109,10 @@ fn what_ends_goes_in_its_time() {
         let folders: Vec<String> = folders.map(|folder| format!("{folder}/")).collect();
         let is_output = |key: &&String| folders.iter().any(|folder| key.starts_with(folder));
         let outputs: BTreeSet<String> = whole.iter().filter(is_output).cloned().collect();
-        assert!(outputs.len() >= manifest.outputs.len());
+        for output in &manifest.outputs {
+            let beside = |ending: &str| outputs.contains(&output.key.replace(".mgs", ending));
+            assert!(output.preview && output.picture && beside(".preview") && beside(".png"), "{outputs:?}");
+        }
         let is_kept =
             |key: &String| outputs.contains(key) || key.contains("/logs/") || *key == keys::manifest(&job);
         assert!(kept.iter().all(is_kept) && outputs.is_subset(&kept), "{kept:?}");

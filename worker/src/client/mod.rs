@@ -307,6 +307,8 @@ impl Client {
         if reply.status().is_success() {
             return Ok(reply);
         }
+        let id = reply.headers().get("x-request-id").and_then(|value| value.to_str().ok());
+        tracing::debug!(request_id = id, status, "refused");
         let seconds = reply.headers().get("retry-after").and_then(|value| value.to_str().ok()?.parse().ok());
         let bytes = reply.body_mut().with_config().limit(1 << 16).read_to_vec().unwrap_or_default();
         let problem = serde_json::from_slice(&bytes).unwrap_or_else(|_| {
