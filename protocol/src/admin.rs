@@ -22,6 +22,9 @@ pub struct WorkerDetail {
     pub leased: i64,
     /// Batches of which it was to blame for the failure, lately.
     pub errors: i64,
+    /// Why the coordinator has locked it, where it has.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub reason: String,
     /// Milliseconds since 1970 when it was last heard of.
     pub last_seen: i64,
 }

@@ -55,6 +55,9 @@ pub struct Arguments {
     /// Bytes of one uploaded file at most
     #[arg(long, value_name = "SIZE", default_value = "1TiB", value_parser = crate::values::size)]
     upload_max: u64,
+    /// One batch in N is baked again by another worker of the same device before it counts; 0: none
+    #[arg(long, value_name = "N", default_value_t = 1_000)]
+    second_opinion: u32,
     /// Days after a job's end that its logs are kept
     #[arg(long, value_name = "DAYS", default_value_t = 30, value_parser = days())]
     log_days: i64,
@@ -91,6 +94,7 @@ pub fn run(arguments: Arguments, log_format: LogFormat) -> Result<Answer> {
         without_tokens: arguments.insecure_local,
         lease_ttl_ms: i64::from(arguments.lease) * 1_000,
         asset_bytes_max: arguments.upload_max,
+        opinion_every: arguments.second_opinion,
         retention: Retention {
             log_days: arguments.log_days,
             event_days: arguments.event_days,

@@ -14,6 +14,7 @@ use protocol::work::{
 use super::{Coordinator, lock};
 use crate::db::claim::{Claimer, Taken};
 use crate::db::complete::{Completion, Reporter};
+use crate::db::opinion::Distrusted;
 use crate::db::worker::Session;
 use crate::error::Kind;
 use crate::scheduler::choose::{Asker, Candidate, Locality, choose};
@@ -243,11 +244,13 @@ impl Coordinator {
             session: &request.session,
             worker: &session.worker,
             around: self.around(&session.worker),
+            opinion_every: self.settings.opinion_every,
         };
         let items = self.verified(request).await?;
         let completion = self.store.complete(&reporter, &items).await?;
         log(&completion, &session.worker, request.pass, &items);
         self.settled(&completion);
+        self.distrust(&completion).await?;
         metrics::histogram!("pantaray_complete_seconds").record(start.elapsed().as_secs_f64());
         for verdict in &completion.verdicts {
             let outcome = match verdict {
@@ -260,6 +263,19 @@ impl Coordinator {
             metrics::counter!("pantaray_completions_total", "outcome" => outcome).increment(1);
         }
         Ok(CompleteReply { verdicts: completion.verdicts, lease_live: completion.lease_live })
+    }
+
+    /// Ends what workers have that are not believed any more.
+    async fn distrust(&self, completion: &Completion) -> Result<()> {
+        for Distrusted { worker, reason, .. } in &completion.distrusted {
+            tracing::error!(worker, job = completion.job, "a worker is locked: {reason}");
+            metrics::counter!("pantaray_workers_distrusted_total").increment(1);
+            self.forget_sessions(worker);
+            for ended in self.store.end_leases_of(worker, "", &self.around(worker)).await? {
+                self.settled(&ended);
+            }
+        }
+        Ok(())
     }
 
     /// Takes batches back untried.

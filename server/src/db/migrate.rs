@@ -5,7 +5,7 @@ use crate::error::Kind;
 use crate::{Error, Result, values};
 
 /// For each version, from 1: SQLite's script and PostgreSQL's.
-const MIGRATIONS: [(&str, &str); 3] = [
+const MIGRATIONS: [(&str, &str); 4] = [
     (
         include_str!("../../../migrations/sqlite/0001_queue.sql"),
         include_str!("../../../migrations/postgres/0001_queue.sql"),
@@ -17,6 +17,10 @@ const MIGRATIONS: [(&str, &str); 3] = [
     (
         include_str!("../../../migrations/sqlite/0003_retention.sql"),
         include_str!("../../../migrations/postgres/0003_retention.sql"),
+    ),
+    (
+        include_str!("../../../migrations/sqlite/0004_trust.sql"),
+        include_str!("../../../migrations/postgres/0004_trust.sql"),
     ),
 ];
 

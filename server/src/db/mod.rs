@@ -18,6 +18,7 @@ pub mod job;
 pub mod lease;
 pub mod list;
 mod migrate;
+pub mod opinion;
 pub mod postgres;
 pub mod retention;
 pub mod sqlite;

@@ -167,7 +167,7 @@ impl Store {
         after: i64,
         limit: i64,
     ) -> Result<BatchPage> {
-        let sql = "SELECT b.seq, b.state, b.fence, b.tries, l.worker, b.sha256 FROM batch b JOIN pass p ON p.id = b.pass_id
+        let sql = "SELECT b.seq, b.state, b.fence, b.tries, COALESCE(l.worker, b.worker), b.sha256 FROM batch b JOIN pass p ON p.id = b.pass_id
             LEFT JOIN lease l ON l.id = b.lease_id
             WHERE b.pass_id = $1 AND p.job_id = $2 AND b.seq > $3 AND ($4 = -1 OR b.state = $4) ORDER BY b.seq LIMIT $5";
         let batch = |row: &Row| {
@@ -194,7 +194,7 @@ impl Store {
     pub async fn failures(&self, job: &str, limit: i64) -> Result<Vec<Failure>> {
         let sql =
             "SELECT f.pass_id, f.seq, f.fence, f.worker, f.class, f.n, f.message, f.at FROM batch_fault f
-            WHERE f.pass_id IN (SELECT id FROM pass WHERE job_id = $1) ORDER BY f.at DESC, f.seq LIMIT $2";
+            WHERE f.pass_id IN (SELECT id FROM pass WHERE job_id = $1) AND f.class <> $3 ORDER BY f.at DESC, f.seq LIMIT $2";
         let failure = |row: &Row| {
             Ok(Failure {
                 pass: row.int(0)?,
@@ -207,7 +207,7 @@ impl Store {
                 at: row.int(7)?,
             })
         };
-        self.query(sql, values![job, limit]).await?.iter().map(failure).collect()
+        self.query(sql, values![job, limit, super::opinion::OPINION]).await?.iter().map(failure).collect()
     }
 
     /// All workers, by name.
@@ -217,7 +217,8 @@ impl Store {
     pub async fn workers(&self, now: i64) -> Result<Vec<WorkerDetail>> {
         let sql = "SELECT w.name, w.labels, w.memory_bytes, w.version, w.locked, w.draining, w.sick_until, w.last_seen,
                 CAST(COALESCE((SELECT SUM(l.n) FROM lease l WHERE l.worker = w.name), 0) AS BIGINT),
-                (SELECT COUNT(*) FROM batch_fault f WHERE f.worker = w.name AND f.class IN (3, 7) AND f.at > $1)
+                (SELECT COUNT(*) FROM batch_fault f WHERE f.worker = w.name AND f.class IN (3, 7) AND f.at > $1),
+                w.reason
             FROM worker w ORDER BY w.name LIMIT 10000";
         let rows = self.query(sql, values![now - crate::scheduler::failure::SICK_MS]).await?;
         let worker = |row: &Row| {
@@ -238,6 +239,7 @@ impl Store {
                 version: row.text(3)?,
                 leased,
                 errors: row.int(9)?,
+                reason: row.text(10)?,
                 last_seen,
             })
         };

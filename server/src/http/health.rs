@@ -51,13 +51,19 @@ fn begin_at_zero() {
             metrics::counter!(name, label => (*word).to_owned()).increment(0);
         }
     }
+    for outcome in ["asked", "agreed", "split", "counted"] {
+        metrics::counter!("pantaray_second_opinions_total", "outcome" => outcome).increment(0);
+    }
     for kind in GcKind::ALL {
         metrics::counter!("pantaray_gc_deleted_total", "kind" => kind.word()).increment(0);
         metrics::counter!("pantaray_gc_deleted_bytes_total", "kind" => kind.word()).increment(0);
     }
-    for name in
-        ["pantaray_leases_expired_total", "pantaray_worker_sick_total", "pantaray_output_divergence_total"]
-    {
+    for name in [
+        "pantaray_leases_expired_total",
+        "pantaray_worker_sick_total",
+        "pantaray_workers_distrusted_total",
+        "pantaray_output_divergence_total",
+    ] {
         metrics::counter!(name).increment(0);
     }
 }
