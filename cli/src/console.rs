@@ -3,6 +3,7 @@
 use std::io::{IsTerminal, Write};
 use std::process::ExitCode;
 
+use clap::ValueEnum;
 use engine::bake::Control;
 use engine::{Error, ErrorKind, Result};
 use serde::Serialize;
@@ -32,6 +33,34 @@ impl Answer {
     }
 }
 
+/// How log lines are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// For people.
+    #[default]
+    Text,
+    /// One JSON object a line, with the ids of request, job, pass, batch and fence as fields of their own.
+    Json,
+}
+
+impl LogFormat {
+    /// Says on standard error what is no answer and no complaint.
+    pub fn tell(self, text: &str) {
+        match self {
+            Self::Text => drop(writeln!(std::io::stderr(), "{text}")),
+            Self::Json => tracing::info!("{text}"),
+        }
+    }
+
+    /// What is logged where `RUST_LOG` says nothing: what is told goes through the log where that is JSON.
+    fn level(self) -> &'static str {
+        match self {
+            Self::Text => "warn",
+            Self::Json => "info",
+        }
+    }
+}
+
 /// Where a subcommand's progress and answer go.
 #[derive(Debug)]
 pub struct Console {
@@ -40,16 +69,18 @@ pub struct Console {
 }
 
 impl Console {
-    /// Sets logging up as `RUST_LOG` says, and a display that suits where standard error goes.
-    pub fn new(json: bool, quiet: bool) -> Self {
+    /// Sets logging up as `RUST_LOG` and `format` say, and a display that suits where standard error goes.
+    pub fn new(json: bool, quiet: bool, format: LogFormat) -> Self {
         let progress = Display::new(quiet);
-        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format.level()));
         let log = progress.log_writer();
-        tracing_subscriber::fmt()
-            .with_env_filter(filter)
-            .with_ansi(colours())
-            .with_writer(move || log.clone())
-            .init();
+        let lines = tracing_subscriber::fmt().with_env_filter(filter).with_writer(move || log.clone());
+        match format {
+            LogFormat::Text => lines.with_ansi(colours()).init(),
+            LogFormat::Json => {
+                lines.json().flatten_event(true).with_current_span(false).with_ansi(false).init();
+            }
+        }
         Self { json, progress }
     }
 

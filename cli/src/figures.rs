@@ -51,6 +51,27 @@ pub fn seconds(value: f64) -> String {
     }
 }
 
+/// A share from 0 to 1: `37 %`.
+pub fn percent(share: f64) -> String {
+    format!("{:.0} %", 100.0 * share)
+}
+
+/// Milliseconds since 1970 as a time of day in UTC: `2026-11-27 21:10:04`.
+pub fn time(milliseconds: i64) -> String {
+    let seconds = milliseconds.div_euclid(1_000);
+    let (day, second) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
+    // Days since 1 March of the year 0, whose leap day is the last one: Howard Hinnant's `civil_from_days`
+    let shifted = day + 719_468;
+    let (era, of_era) = (shifted.div_euclid(146_097), shifted.rem_euclid(146_097));
+    let year = (of_era - of_era / 1_460 + of_era / 36_524 - of_era / 146_096) / 365;
+    let of_year = of_era - (365 * year + year / 4 - year / 100);
+    let month = (5 * of_year + 2) / 153;
+    let date = of_year - (153 * month + 2) / 5 + 1;
+    let (month, is_next) = if month < 10 { (month + 3, 0) } else { (month - 9, 1) };
+    let (hour, minute) = (second / 3_600, second / 60 % 60);
+    format!("{:04}-{month:02}-{date:02} {hour:02}:{minute:02}:{:02}", 400 * era + year + is_next, second % 60)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -71,5 +92,21 @@ mod tests {
         assert_eq!(seconds(59.99), "1 min 0 s");
         assert_eq!(seconds(4.21), "4.2 s");
         assert_eq!(seconds(7500.0), "2 h 5 min");
+        assert_eq!(percent(0.374), "37 %");
+    }
+
+    /// Catches a day that is off by one around leap days and turns of the year.
+    #[test]
+    fn times_are_the_calendars() {
+        for (milliseconds, text) in [
+            (0, "1970-01-01 00:00:00"),
+            (951_782_400_000, "2000-02-29 00:00:00"),
+            (951_868_799_999, "2000-02-29 23:59:59"),
+            (1_709_251_200_000, "2024-03-01 00:00:00"),
+            (1_767_225_599_000, "2025-12-31 23:59:59"),
+            (-1, "1969-12-31 23:59:59"),
+        ] {
+            assert_eq!(time(milliseconds), text);
+        }
     }
 }

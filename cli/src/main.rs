@@ -24,7 +24,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use engine::Result;
 
-use console::{Answer, Console};
+use console::{Answer, Console, LogFormat};
 
 /// Directional occlusion for film lighting, baked in spherical harmonics from scenes many times larger than memory.
 #[derive(Debug, Parser)]
@@ -38,6 +38,9 @@ struct Arguments {
     /// Show no progress
     #[arg(long, short, global = true, help_heading = EVERYWHERE)]
     quiet: bool,
+    /// How log lines are written
+    #[arg(long, global = true, value_enum, value_name = "FORMAT", default_value_t, env = "PANTARAY_LOG_FORMAT", help_heading = EVERYWHERE)]
+    log_format: LogFormat,
 }
 
 /// Heads the options that every subcommand has.
@@ -70,10 +73,22 @@ enum Command {
     /// Let a paused job go on
     Resume(farm::control::JobArguments),
     Retry(farm::control::RetryArguments),
+    Reprioritise(farm::control::ReprioritiseArguments),
+    Resubmit(farm::control::ResubmitArguments),
     Workers(farm::jobs::WorkersArguments),
     Logs(farm::logs::Arguments),
     Fetch(farm::fetch::Arguments),
+    Delete(farm::gc::DeleteArguments),
+    Gc(farm::gc::Arguments),
+    /// List, make and change projects
+    #[command(subcommand)]
+    Project(farm::admin::ProjectCommand),
+    Limits(farm::admin::LimitsArguments),
+    Audit(farm::admin::AuditArguments),
+    Ticket(farm::admin::TicketArguments),
+    Enrol(farm::admin::EnrolArguments),
     Serve(service::serve::Arguments),
+    Migrate(service::migrate::Arguments),
     Sim(service::sim::Arguments),
     /// Make, list and revoke tokens
     #[command(subcommand)]
@@ -81,13 +96,13 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let Arguments { command, json, quiet } = Arguments::parse();
-    let console = Console::new(json, quiet);
-    let result = signals::install().and_then(|()| run(command, &console));
+    let Arguments { command, json, quiet, log_format } = Arguments::parse();
+    let console = Console::new(json, quiet, log_format);
+    let result = signals::install(log_format).and_then(|()| run(command, &console, log_format));
     console.finish(result)
 }
 
-fn run(command: Command, console: &Console) -> Result<Answer> {
+fn run(command: Command, console: &Console, log_format: LogFormat) -> Result<Answer> {
     match command {
         Command::Demo(arguments) => demo::run(arguments, console),
         Command::Import(arguments) => import::run(arguments, console),
@@ -107,10 +122,20 @@ fn run(command: Command, console: &Console) -> Result<Answer> {
         Command::Pause(arguments) => farm::control::run(arguments, "pause", console),
         Command::Resume(arguments) => farm::control::run(arguments, "resume", console),
         Command::Retry(arguments) => farm::control::run_retry(arguments, console),
+        Command::Reprioritise(arguments) => farm::control::run_reprioritise(arguments),
+        Command::Resubmit(arguments) => farm::control::run_resubmit(arguments),
         Command::Workers(arguments) => farm::jobs::run_workers(arguments, console),
         Command::Logs(arguments) => farm::logs::run(arguments, console),
         Command::Fetch(arguments) => farm::fetch::run(arguments, console),
-        Command::Serve(arguments) => service::serve::run(arguments),
+        Command::Delete(arguments) => farm::gc::run_delete(arguments, console),
+        Command::Gc(arguments) => farm::gc::run(arguments, console),
+        Command::Project(command) => farm::admin::run_project(command),
+        Command::Limits(arguments) => farm::admin::run_limits(arguments),
+        Command::Audit(arguments) => farm::admin::run_audit(arguments),
+        Command::Ticket(arguments) => farm::admin::run_ticket(arguments),
+        Command::Enrol(arguments) => farm::admin::run_enrol(arguments),
+        Command::Serve(arguments) => service::serve::run(arguments, log_format),
+        Command::Migrate(arguments) => service::migrate::run(arguments),
         Command::Sim(arguments) => service::sim::run(&arguments, console),
         Command::Token(command) => service::token::run(command),
     }

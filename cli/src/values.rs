@@ -36,6 +36,19 @@ pub fn count(text: &str) -> Result<u64, String> {
     }
 }
 
+/// A number, or the word that there is none.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OrNone(pub Option<i64>);
+
+/// `none`, or a whole number from 0 on.
+pub fn number_or_none(text: &str) -> Result<OrNone, String> {
+    match (text, text.parse::<i64>()) {
+        ("none", _) => Ok(OrNone(None)),
+        (_, Ok(number)) if number >= 0 => Ok(OrNone(Some(number))),
+        _ => Err("expected a whole number, or `none`".into()),
+    }
+}
+
 /// A decimal number and a unit, as a whole number of the smallest unit.
 fn scaled(text: &str, units: &[(&str, u64)]) -> Option<u64> {
     let end = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());

@@ -22,6 +22,9 @@ pub struct WorkerDetail {
     pub leased: i64,
     /// Batches of which it was to blame for the failure, lately.
     pub errors: i64,
+    /// Why the coordinator has locked it, where it has.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub reason: String,
     /// Milliseconds since 1970 when it was last heard of.
     pub last_seen: i64,
 }
@@ -116,7 +119,15 @@ pub struct Project {
     /// Its share of the farm, against those of others.
     pub share: i64,
     /// Batches that run at once at most, over all of its jobs.
+    #[serde(default)]
     pub running_max: Option<i64>,
+    /// Days after a job's end that its batches, parts and scene are kept: 14 unless something is said; a change that says
+    /// nothing leaves it as it is.
+    #[serde(default)]
+    pub retention_days: Option<i64>,
+    /// Days after a job's end that what it published is kept: for ever unless something is said; likewise.
+    #[serde(default)]
+    pub outputs_days: Option<i64>,
 }
 
 /// A change, and who made it.
@@ -146,23 +157,6 @@ pub struct AuditPage {
     /// The cursor of the next page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<i64>,
-}
-
-/// What garbage collection removed, or would remove.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-pub struct GcReport {
-    /// Whether nothing was removed.
-    pub dry_run: bool,
-    /// Folders of jobs that are past their retention.
-    pub jobs: Vec<String>,
-    /// Parts that no manifest and no merge needs any more.
-    pub parts: u64,
-    /// Assets that no job refers to.
-    pub assets: u64,
-    /// Brick maps that no job refers to.
-    pub brick_maps: u64,
-    /// Bytes of all of these.
-    pub bytes: u64,
 }
 
 /// A browser signs in with a token.

@@ -197,6 +197,9 @@ pub struct JobSummary {
     pub ended_at: Option<i64>,
     /// Rises with every change.
     pub version: i64,
+    /// Whether its batches, parts and scene are gone: it is past its retention, or was deleted.
+    #[serde(default)]
+    pub pruned: bool,
 }
 
 /// A page of jobs, latest first.

@@ -7,6 +7,7 @@
 
 pub mod admin;
 pub mod events;
+pub mod gc;
 pub mod job;
 pub mod keys;
 pub mod limits;

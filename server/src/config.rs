@@ -7,6 +7,8 @@ use std::path::Path;
 use engine::scene::Roots;
 use protocol::limits;
 
+use crate::db::retention::Retention;
+
 /// Settings of a coordinator.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -28,6 +30,10 @@ pub struct Settings {
     pub lease_ttl_ms: i64,
     /// Bytes of one uploaded asset, or of an object of a worker, at most.
     pub asset_bytes_max: u64,
+    /// One result in so many is baked again by another worker before it counts; none where this is 0.
+    pub opinion_every: u32,
+    /// How long things are kept that no project decides about.
+    pub retention: Retention,
 }
 
 impl Settings {
@@ -43,6 +49,8 @@ impl Settings {
             without_tokens: false,
             lease_ttl_ms: limits::LEASE_TTL_MS,
             asset_bytes_max: limits::ASSET_BYTES_MAX,
+            opinion_every: 0,
+            retention: Retention::default(),
         }
     }
 }

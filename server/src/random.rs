@@ -22,6 +22,13 @@ pub fn id(now_ms: i64) -> String {
     digits(u128::from_be_bytes(random), 26)
 }
 
+/// The time in an id that [`id`] made; none where `text` is none.
+pub fn time_of(text: &str) -> Option<i64> {
+    let place = |byte| DIGITS.iter().position(|&digit| digit == byte);
+    let value = text.bytes().try_fold(0_u128, |value, byte| Some(value << 5 | place(byte)? as u128));
+    (text.len() == 26).then_some(value? >> 80).map(|ms| ms as i64)
+}
+
 /// A secret of 160 bits, 32 characters.
 pub fn secret() -> String {
     let mut bytes = [0; 32];
@@ -41,5 +48,7 @@ mod tests {
         let ids: Vec<String> = (0..200).map(|i| super::id(1_700_000_000_000 + i)).collect();
         assert!(ids.is_sorted() && ids.iter().all(|id| id.len() == 26));
         assert_ne!(super::id(5), super::id(5));
+        assert_eq!(super::time_of(&ids[7]), Some(1_700_000_000_007));
+        assert_eq!(super::time_of("default"), None);
     }
 }

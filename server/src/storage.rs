@@ -195,6 +195,15 @@ impl Storage {
         self.store.list(Some(&Path::from(folder))).map_err(Error::from).boxed()
     }
 
+    /// The names of folders in a folder.
+    ///
+    /// # Errors
+    /// When storage refuses.
+    pub async fn folders(&self, folder: &str) -> Result<Vec<String>> {
+        let found = self.store.list_with_delimiter(Some(&Path::from(folder))).await?;
+        Ok(found.common_prefixes.iter().filter_map(|path| path.filename().map(str::to_owned)).collect())
+    }
+
     /// Removes an object; one that is not there is no error.
     ///
     /// # Errors

@@ -3,12 +3,15 @@
 use std::time::Duration;
 
 use protocol::admin::{
-    EnrolRequest, MissingReply, MissingRequest, Project, Secret, TokenDetail, TokenRequest, WorkerDetail,
+    AuditPage, EnrolRequest, MissingReply, MissingRequest, Project, Secret, TicketRequest, TokenDetail,
+    TokenRequest, WorkerDetail,
 };
+use protocol::gc::{DeletePreview, GcReport, GcRequest};
 use protocol::job::{
-    BatchSelection, Changed, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary, Manifest,
-    Submitted,
+    BatchSelection, Changed, Estimate, Failure, JobDetail, JobPage, JobPatch, JobRequest, JobSummary,
+    Manifest, ResubmitRequest, Submitted,
 };
+use protocol::overview::FarmDetail;
 use protocol::storage::{SceneFiles, UrlsReply, UrlsRequest};
 use protocol::work::{
     Claim, ClaimRequest, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest, LogRequest,
@@ -87,6 +90,16 @@ impl Client {
         self.post_once("/v1/jobs", request, key)
     }
 
+    /// Checks a submission, and says what it would ask of the farm.
+    pub fn validate(&self, request: &JobRequest) -> Result<Estimate> {
+        self.post("/v1/jobs/validate", request, Duration::ZERO)
+    }
+
+    /// Submits a job again, with edits; a repetition with the same `key` makes no second job.
+    pub fn resubmit(&self, job: &str, edits: &ResubmitRequest, key: &str) -> Result<Submitted> {
+        self.post_once(&format!("/v1/jobs/{job}/resubmit"), edits, key)
+    }
+
     /// A page of jobs, latest first. `query` goes as it is.
     pub fn jobs(&self, query: &str) -> Result<JobPage> {
         self.get(&format!("/v1/jobs{query}"))
@@ -122,15 +135,40 @@ impl Client {
         self.get(&format!("/v1/jobs/{job}/manifest"))
     }
 
+    /// What would go with a job if it were deleted.
+    pub fn delete_preview(&self, job: &str) -> Result<DeletePreview> {
+        self.get(&format!("/v1/jobs/{job}/delete-preview"))
+    }
+
+    /// Deletes a job that has ended.
+    pub fn delete_job(&self, job: &str) -> Result<Value> {
+        self.delete(&format!("/v1/jobs/{job}"))
+    }
+
     /// The farm's workers.
     pub fn workers(&self) -> Result<Vec<WorkerDetail>> {
         self.get("/v1/workers")
+    }
+
+    /// The farm at a glance.
+    pub fn farm(&self) -> Result<FarmDetail> {
+        self.get("/v1/farm")
+    }
+
+    /// The projects that the caller may see.
+    pub fn projects(&self) -> Result<Vec<Project>> {
+        self.get("/v1/projects")
     }
 }
 
 /// What administrators ask. Errors are those of [`Client::get`].
 #[expect(clippy::missing_errors_doc, reason = "said once, above")]
 impl Client {
+    /// Collects garbage for some seconds, or says what there is.
+    pub fn collect_garbage(&self, request: &GcRequest) -> Result<GcReport> {
+        self.post("/v1/gc", request, Duration::from_secs(20))
+    }
+
     /// Makes a token.
     pub fn create_token(&self, request: &TokenRequest) -> Result<Secret> {
         self.post("/v1/tokens", request, Duration::ZERO)
@@ -139,6 +177,21 @@ impl Client {
     /// All tokens, latest first.
     pub fn tokens(&self) -> Result<Vec<TokenDetail>> {
         self.get("/v1/tokens")
+    }
+
+    /// Locks, unlocks or drains a worker.
+    pub fn act_on_worker(&self, worker: &str, action: &str) -> Result<Value> {
+        self.post(&format!("/v1/workers/{worker}/{action}"), &json!({}), Duration::ZERO)
+    }
+
+    /// Makes a ticket, by which workers enrol.
+    pub fn create_ticket(&self, request: &TicketRequest) -> Result<Secret> {
+        self.post("/v1/tickets", request, Duration::ZERO)
+    }
+
+    /// A page of the audit, latest first. `query` goes as it is.
+    pub fn audit(&self, query: &str) -> Result<AuditPage> {
+        self.get(&format!("/v1/audit{query}"))
     }
 
     /// Makes a project, or changes its share.

@@ -47,23 +47,21 @@ pub fn deliver(client: &Client, pulse: &Pulse, spool: &Spool) {
 
 /// Puts a part, and says what became of its batch.
 fn item(client: &Client, pulse: &Pulse, part: &Spooled) -> CompleteItem {
+    let (batch, fence) = (part.batch.batch, part.batch.fence);
+    let span = tracing::error_span!("delivery", job = part.job, pass = part.pass, batch, fence);
+    let _span = span.entered();
     let depot = LeaseDepot {
         client: client.with_patience(PATIENCE),
         session: pulse.session.clone(),
         lease: part.lease.id.clone(),
     };
     let FolderFile { sha256, bytes } = &part.content;
-    let key = keys::part(&part.job, part.pass, part.batch.batch, part.batch.fence, sha256);
+    let key = keys::part(&part.job, part.pass, batch, fence, sha256);
     let put = match bytes {
         0 => Ok(()),
         _ => insist(pulse, &part.lease, || depot.write(&key, &part.path, &part.content)),
     };
-    let log = LogRequest {
-        session: pulse.session.clone(),
-        batch: part.batch.batch,
-        fence: part.batch.fence,
-        text: part.log.clone(),
-    };
+    let log = LogRequest { session: pulse.session.clone(), batch, fence, text: part.log.clone() };
     // A log line is not worth a second try
     if let Err(error) = client.with_patience(Duration::ZERO).add_log(&part.lease.id, &log) {
         tracing::debug!("a log line is lost: {error}");
@@ -73,7 +71,7 @@ fn item(client: &Client, pulse: &Pulse, part: &Spooled) -> CompleteItem {
         Err(error) => failed(error),
     };
     let elapsed_ms = i64::try_from(part.elapsed.as_millis()).unwrap_or(i64::MAX);
-    CompleteItem { batch: part.batch.batch, fence: part.batch.fence, elapsed_ms, outcome }
+    CompleteItem { batch, fence, elapsed_ms, outcome }
 }
 
 /// A failure as an outcome.

@@ -204,7 +204,10 @@ impl Desk<'_> {
     /// Executes a claim and reports what came of it.
     fn execute(&mut self, claimed: &Claimed, claims: &mut Claims) {
         let Claimed { claim, lease } = claimed;
-        tracing::info!(job = claim.task.job, pass = claim.pass, kind = %claim.task.kind, batches = claim.batches.len(), "claimed");
+        let task = &claim.task;
+        let span = tracing::error_span!("claim", job = task.job, pass = claim.pass, kind = %task.kind, lease = lease.id);
+        let _span = span.entered();
+        tracing::info!(batches = claim.batches.len(), "claimed");
         self.summary.claims += 1;
         let client = self.options.client.with_patience(PATIENCE);
         let (session, id) = (self.pulse.session.clone(), lease.id.clone());
@@ -228,7 +231,9 @@ impl Desk<'_> {
             Ok(None) => return self.give_back(claimed, rest),
             Err(error) if error.is_cancelled() => return self.give_back(claimed, rest),
             Err(error) => {
-                tracing::error!(job = claim.task.job, pass = claim.pass, class = %error.class(), "{error}");
+                let batch = rest.first();
+                let (batch, fence) = (batch.map(|batch| batch.batch), batch.map(|batch| batch.fence));
+                tracing::error!(batch, fence, class = %error.class(), "{error}");
                 self.summary.failed += 1;
                 failed(error)
             }

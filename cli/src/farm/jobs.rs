@@ -21,11 +21,31 @@ pub struct Arguments {
     limit: u16,
 }
 
-/// List the farm's workers
+/// List the farm's workers, or change one
 #[derive(Debug, Args)]
 pub struct WorkersArguments {
+    /// The worker to change
+    #[arg(requires = "action")]
+    worker: Option<String>,
     #[command(flatten)]
     connection: Connection,
+    #[command(flatten)]
+    action: WorkerAction,
+}
+
+/// What to do with a worker.
+#[derive(Debug, Args)]
+#[group(id = "action", multiple = false, requires = "worker")]
+struct WorkerAction {
+    /// Give it no more work
+    #[arg(long)]
+    lock: bool,
+    /// Give it work again, also where it was put to rest
+    #[arg(long)]
+    unlock: bool,
+    /// Let it finish what it has and take no more, until it is started again or unlocked
+    #[arg(long)]
+    drain: bool,
 }
 
 /// Lists jobs, or shows one.
@@ -41,11 +61,22 @@ pub fn run(arguments: Arguments, _console: &Console) -> Result<Answer> {
     Answer::new(&page, table(&rows))
 }
 
-/// Lists workers.
+/// Lists workers, or changes one.
 pub fn run_workers(arguments: WorkersArguments, _console: &Console) -> Result<Answer> {
-    let workers = arguments.connection.client()?.workers()?;
-    let mut rows =
-        vec![["WORKER", "STATE", "BATCHES", "MEMORY", "ERRORS", "VERSION", "LABELS"].map(String::from)];
+    let client = arguments.connection.client()?;
+    if let Some(worker) = &arguments.worker {
+        let (action, done) = match arguments.action {
+            WorkerAction { lock: true, .. } => ("lock", "locked"),
+            WorkerAction { unlock: true, .. } => ("unlock", "unlocked"),
+            WorkerAction { .. } => ("drain", "drained"),
+        };
+        client.act_on_worker(worker, action)?;
+        return Answer::new(&serde_json::json!({ done: worker }), format!("{worker} is {done}"));
+    }
+    let workers = client.workers()?;
+    let mut rows = vec![
+        ["WORKER", "STATE", "BATCHES", "MEMORY", "ERRORS", "VERSION", "LABELS, WHY LOCKED"].map(String::from),
+    ];
     rows.extend(workers.iter().map(worker_row));
     Answer::new(&workers, table(&rows))
 }
@@ -72,7 +103,7 @@ fn worker_row(worker: &WorkerDetail) -> [String; 7] {
         figures::bytes(worker.memory_bytes.max(0).unsigned_abs()),
         worker.errors.to_string(),
         worker.version.clone(),
-        worker.labels.join(" "),
+        printable(&[&worker.labels[..], std::slice::from_ref(&worker.reason)].concat().join(" ")),
     ]
 }
 
@@ -103,10 +134,10 @@ fn describe(job: &JobDetail) -> String {
 }
 
 /// Columns side by side, the last one as it is.
-fn table(rows: &[[String; 7]]) -> String {
+pub(super) fn table<const N: usize>(rows: &[[String; N]]) -> String {
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..7).map(width).collect();
-    let line = |row: &[String; 7]| {
+    let widths: Vec<usize> = (0..N).map(width).collect();
+    let line = |row: &[String; N]| {
         let cells = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}"));
         cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
     };
@@ -114,7 +145,7 @@ fn table(rows: &[[String; 7]]) -> String {
 }
 
 /// What somebody else wrote, without what would move the cursor.
-fn printable(text: &str) -> String {
+pub(super) fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }
 

@@ -1,8 +1,10 @@
 //! The farm's commands: how a coordinator is reached, and what several of them need.
 
+pub mod admin;
 pub mod control;
 pub mod fetch;
 mod files;
+pub mod gc;
 pub mod jobs;
 pub mod logs;
 pub mod submit;

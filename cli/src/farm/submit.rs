@@ -7,14 +7,15 @@ use clap::Args;
 use engine::scene::{Roots, Scene, load_confined, load_frame};
 use engine::{Error, Result};
 use protocol::admin::MissingRequest;
-use protocol::job::{BakeSettings, JobRequest};
+use protocol::job::{BakeSettings, Estimate, JobRequest};
 use worker::client::Client;
 use worker::digest;
 
 use super::files::{Files, collect};
+use super::jobs::table;
 use super::{Connection, left, pair, random_key, watch};
 use crate::console::{Answer, Console};
-use crate::{signals, values};
+use crate::{figures, signals, values};
 
 /// Submit a scene to the farm; files that the farm does not have are uploaded
 #[derive(Debug, Args)]
@@ -44,6 +45,12 @@ pub struct Arguments {
     /// Publish what there is when batches fail, marked as incomplete
     #[arg(long)]
     partial: bool,
+    /// Batches to run at once at most
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    running_max: Option<i64>,
+    /// Batches that may fail before the job is given up
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(i64).range(0..))]
+    failed_max: i64,
     /// Show, sequence and shot, with slashes
     #[arg(long, value_name = "SHOW/SEQ/SHOT", default_value = "")]
     shot: String,
@@ -78,8 +85,11 @@ pub struct Arguments {
     #[arg(long)]
     key: Option<String>,
     /// Wait until it is done; exit code 1 if it fails
-    #[arg(long)]
+    #[arg(long, conflicts_with = "dry_run")]
     wait: bool,
+    /// Upload and check the scene, say what it would ask of the farm, and submit nothing
+    #[arg(long)]
+    dry_run: bool,
 }
 
 /// Uploads, submits, and waits if asked to.
@@ -94,6 +104,10 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
             false => Ok(()),
         }
     })?;
+    if arguments.dry_run {
+        let estimate = client.validate(&request(arguments, text, hashes))?;
+        return Answer::new(&estimate, describe(&estimate));
+    }
     let key = arguments.key.clone().unwrap_or_else(random_key);
     let wait = arguments.wait;
     let submitted = client.submit(&request(arguments, text, hashes), &key)?;
@@ -105,6 +119,27 @@ pub fn run(arguments: Arguments, console: &Console) -> Result<Answer> {
         jobs.push(watch::until_done(&client, job, console, signals::cancel_flag(), || left(job))?);
     }
     watch::judge(&jobs)
+}
+
+/// What a scene would ask of the farm.
+fn describe(estimate: &Estimate) -> String {
+    let known = |number: Option<u64>, show: fn(u64) -> String| number.map_or("?".into(), show);
+    let mut rows = vec![["BAKE SET", "POINTS", "BATCHES", "RESULT"].map(String::from)];
+    let row = |name: &str, points, batches, bytes| {
+        [
+            name.into(),
+            known(points, figures::count),
+            known(batches, figures::count),
+            known(bytes, figures::bytes),
+        ]
+    };
+    rows.extend(estimate.sets.iter().map(|set| row(&set.name, set.points, set.batches, set.result_bytes)));
+    rows.push(row("all", estimate.points, estimate.batches, estimate.result_bytes));
+    let inputs = figures::bytes(estimate.input_bytes);
+    let seconds = estimate.worker_seconds.map_or("no bake has shown how long that takes".into(), |seconds| {
+        format!("about {} of one worker", figures::seconds(seconds))
+    });
+    format!("{}\nit reads {inputs}; {seconds}", table(&rows))
 }
 
 /// The scene's text and the files that it needs, over all frames.
@@ -177,8 +212,8 @@ fn request(arguments: Arguments, scene: String, files: BTreeMap<String, String>)
         paused: arguments.paused,
         depends_on: arguments.after,
         requires: arguments.requires,
-        running_max: None,
-        failed_max: 0,
+        running_max: arguments.running_max,
+        failed_max: arguments.failed_max,
         partial: arguments.partial,
         show: part(),
         sequence: part(),

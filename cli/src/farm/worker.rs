@@ -52,7 +52,7 @@ pub fn run(arguments: Arguments, _console: &Console) -> Result<Answer> {
     let options = Options {
         client: arguments.connection.client()?,
         name: arguments.name.unwrap_or_else(host_name),
-        labels: arguments.label,
+        labels: with_device(arguments.label, arguments.device)?,
         cache: arguments.cache,
         cache_bytes: arguments.cache_size,
         spool_bytes: arguments.spool_size,
@@ -71,8 +71,32 @@ pub fn run(arguments: Arguments, _console: &Console) -> Result<Answer> {
     Answer::new(&summary, text)
 }
 
+/// The labels, and one that names what traces here: results of the same are compared to the byte.
+fn with_device(mut labels: Vec<String>, device: Device) -> Result<Vec<String>> {
+    if !labels.iter().any(|label| label.starts_with("device=")) {
+        labels.push(format!("device={}", device_name(device)?));
+    }
+    Ok(labels)
+}
+
+#[cfg(feature = "gpu")]
+fn device_name(device: Device) -> Result<String> {
+    let adapters = engine::trace::gpu::choose(device)?.adapters;
+    let names: Vec<&str> = adapters.iter().map(|adapter| adapter.name.as_str()).collect();
+    let plain = |c: char| if c.is_ascii_alphanumeric() || c == '.' { c } else { '_' };
+    Ok(match names.join("+") {
+        names if names.is_empty() => "cpu".into(),
+        names => names.chars().map(plain).take(80).collect(),
+    })
+}
+
+#[cfg(not(feature = "gpu"))]
+fn device_name(_device: Device) -> Result<String> {
+    Ok("cpu".into())
+}
+
 /// The host's name, or one that says that it has none.
-fn host_name() -> String {
+pub(super) fn host_name() -> String {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     match name.trim() {
         "" => "unnamed".into(),

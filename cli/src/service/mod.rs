@@ -1,6 +1,7 @@
 //! The coordinator's commands: to serve, and what administrators do.
 
 mod embedded;
+pub mod migrate;
 pub mod serve;
 pub mod sim;
 pub mod token;
@@ -64,7 +65,7 @@ fn told(error: server::Error) -> Error {
 }
 
 /// Writes a secret to a file that only its owner can read; what stood there is replaced.
-fn write_secret(path: &Path, secret: &str) -> std::io::Result<()> {
+pub fn write_secret(path: &Path, secret: &str) -> std::io::Result<()> {
     use std::io::Write;
     use std::os::unix::fs::OpenOptionsExt;
     let temporary = path.with_extension("new");

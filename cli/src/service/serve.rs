@@ -13,10 +13,11 @@ use protocol::admin::{Secret, TokenRequest};
 use serde_json::json;
 use server::config::Settings;
 use server::coordinator::Coordinator;
+use server::db::retention::Retention;
 
 use super::embedded::{self, Crew};
 use super::{Place, block_on, write_secret};
-use crate::console::Answer;
+use crate::console::{Answer, LogFormat};
 use crate::signals;
 
 /// How long the token of embedded workers holds; it is revoked when their process ends in peace.
@@ -54,10 +55,26 @@ pub struct Arguments {
     /// Bytes of one uploaded file at most
     #[arg(long, value_name = "SIZE", default_value = "1TiB", value_parser = crate::values::size)]
     upload_max: u64,
+    /// One batch in N is baked again by another worker of the same device before it counts; 0: none
+    #[arg(long, value_name = "N", default_value_t = 1_000)]
+    second_opinion: u32,
+    /// Days after a job's end that its logs are kept
+    #[arg(long, value_name = "DAYS", default_value_t = 30, value_parser = days())]
+    log_days: i64,
+    /// Days that events are kept
+    #[arg(long, value_name = "DAYS", default_value_t = 7, value_parser = days())]
+    event_days: i64,
+    /// Days that the audit is kept
+    #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = days())]
+    audit_days: i64,
+}
+
+fn days() -> clap::builder::RangedI64ValueParser {
+    clap::value_parser!(i64).range(1..=36_500)
 }
 
 /// Serves until SIGTERM or SIGINT.
-pub fn run(arguments: Arguments) -> Result<Answer> {
+pub fn run(arguments: Arguments, log_format: LogFormat) -> Result<Answer> {
     let loopback = |ip: IpAddr| ip.is_loopback();
     if arguments.insecure_local && !loopback(arguments.listen.ip()) {
         let message = format!("`{}` can be reached from elsewhere", arguments.listen);
@@ -77,6 +94,12 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         without_tokens: arguments.insecure_local,
         lease_ttl_ms: i64::from(arguments.lease) * 1_000,
         asset_bytes_max: arguments.upload_max,
+        opinion_every: arguments.second_opinion,
+        retention: Retention {
+            log_days: arguments.log_days,
+            event_days: arguments.event_days,
+            audit_days: arguments.audit_days,
+        },
     };
     let (place, listen, count) = (arguments.place.clone(), arguments.listen, arguments.workers);
     let served = block_on(async move {
@@ -86,9 +109,9 @@ pub fn run(arguments: Arguments) -> Result<Answer> {
         })?;
         let listen = listener.local_addr()?;
         if !coordinator.settings.without_tokens && !coordinator.store.has_tokens().await? {
-            first_token(&coordinator, &place).await?;
+            first_token(&coordinator, &place, log_format).await?;
         }
-        eprintln!("listening at http://{listen}");
+        log_format.tell(&format!("listening at http://{listen}"));
         let token = if count > 0 { worker_token(&coordinator).await? } else { None };
         let stop = until_done(coordinator.clone(), count, token, listen, place.data.join("workers"));
         server::http::serve(coordinator, listener, stop).await?;
@@ -104,13 +127,13 @@ fn option(text: &str) -> Result<(String, String), String> {
 }
 
 /// A database without tokens gets one, for its administrator.
-async fn first_token(coordinator: &Coordinator, place: &Place) -> server::Result<()> {
+async fn first_token(coordinator: &Coordinator, place: &Place, log_format: LogFormat) -> server::Result<()> {
     let (project, expires_s) = (None, None);
     let request = TokenRequest { role: Role::Admin, project, label: "first".into(), expires_s };
     let made = server::http::make_token(&coordinator.store, &request, coordinator.now()).await?;
     let path = place.data.join("admin.token");
     write_secret(&path, &made.secret)?;
-    eprintln!("an administrator's token is in {}", path.display());
+    log_format.tell(&format!("an administrator's token is in {}", path.display()));
     Ok(())
 }
 
@@ -138,12 +161,12 @@ async fn until_done(
     until_stopped().await;
     match workers {
         Ok(workers) => drop(tokio::task::spawn_blocking(move || embedded::join(workers)).await),
-        Err(error) => eprintln!("no embedded workers: {error}"),
+        Err(error) => tracing::error!("no embedded workers: {error}"),
     }
     if let Some(token) = token
         && let Err(error) = coordinator.store.revoke_token(&token.id, coordinator.now()).await
     {
-        eprintln!("the token of the embedded workers is not revoked: {error}");
+        tracing::error!("the token of the embedded workers is not revoked: {error}");
     }
 }
 

@@ -3,6 +3,7 @@
 #![cfg(unix)]
 
 mod faults;
+mod people;
 mod processes;
 mod proxy;
 mod s3;

@@ -5,6 +5,7 @@
 
 pub mod bytes;
 mod estimate;
+pub mod gc;
 pub mod pace;
 mod publish;
 pub mod submit;

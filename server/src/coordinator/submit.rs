@@ -48,6 +48,10 @@ impl Coordinator {
         submitter: Submitter<'_>,
     ) -> Result<Submitted> {
         let (summary, mut request) = (self.store.job(job).await?, self.store.job_request(job).await?);
+        if summary.pruned {
+            return Err(Error::new(Kind::Conflict, "the job is past its retention: its scene is gone")
+                .hint("submit its scene anew"));
+        }
         request.scene = self.scene(job).await?;
         request.settings = edits.settings.clone().unwrap_or(request.settings);
         request.settings.frame = summary.frame.or(request.settings.frame);

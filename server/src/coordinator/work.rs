@@ -7,13 +7,14 @@ use std::time::{Duration, Instant};
 use protocol::keys;
 use protocol::limits::{self, CLAIM_MAX};
 use protocol::work::{
-    Claim, ClaimRequest, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest, PROTOCOL_VERSION,
-    RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
+    Claim, ClaimRequest, CompleteItem, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest,
+    Outcome, PROTOCOL_VERSION, RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
 };
 
 use super::{Coordinator, lock};
 use crate::db::claim::{Claimer, Taken};
 use crate::db::complete::{Completion, Reporter};
+use crate::db::opinion::Distrusted;
 use crate::db::worker::Session;
 use crate::error::Kind;
 use crate::scheduler::choose::{Asker, Candidate, Locality, choose};
@@ -243,10 +244,13 @@ impl Coordinator {
             session: &request.session,
             worker: &session.worker,
             around: self.around(&session.worker),
+            opinion_every: self.settings.opinion_every,
         };
         let items = self.verified(request).await?;
         let completion = self.store.complete(&reporter, &items).await?;
+        log(&completion, &session.worker, request.pass, &items);
         self.settled(&completion);
+        self.distrust(&completion).await?;
         metrics::histogram!("pantaray_complete_seconds").record(start.elapsed().as_secs_f64());
         for verdict in &completion.verdicts {
             let outcome = match verdict {
@@ -259,6 +263,19 @@ impl Coordinator {
             metrics::counter!("pantaray_completions_total", "outcome" => outcome).increment(1);
         }
         Ok(CompleteReply { verdicts: completion.verdicts, lease_live: completion.lease_live })
+    }
+
+    /// Ends what workers have that are not believed any more.
+    async fn distrust(&self, completion: &Completion) -> Result<()> {
+        for Distrusted { worker, reason, .. } in &completion.distrusted {
+            tracing::error!(worker, job = completion.job, "a worker is locked: {reason}");
+            metrics::counter!("pantaray_workers_distrusted_total").increment(1);
+            self.forget_sessions(worker);
+            for ended in self.store.end_leases_of(worker, "", &self.around(worker)).await? {
+                self.settled(&ended);
+            }
+        }
+        Ok(())
     }
 
     /// Takes batches back untried.
@@ -303,6 +320,22 @@ impl Coordinator {
     }
 }
 
+/// Logs what became of batches: failures for everybody, all of it for who wants to know.
+fn log(completion: &Completion, worker: &str, pass: i64, items: &[CompleteItem]) {
+    let job = completion.job.as_str();
+    for (item, verdict) in items.iter().zip(&completion.verdicts) {
+        let (batch, fence) = (item.batch, item.fence);
+        match &item.outcome {
+            Outcome::Failed { class, message, .. } => {
+                tracing::warn!(job, pass, batch, fence, worker, %class, ?verdict, "a batch failed: {message}");
+            }
+            Outcome::Done { .. } => {
+                tracing::debug!(job, pass, batch, fence, worker, ?verdict, "a batch is done");
+            }
+        }
+    }
+}
+
 /// Counts a claim among those that wait for as long as it lives.
 struct Waiting<'a>(&'a Coordinator);
 
@@ -313,7 +346,6 @@ impl Drop for Waiting<'_> {
 }
 
 fn check_items(request: &CompleteRequest) -> Result<()> {
-    use protocol::work::Outcome;
     if request.items.is_empty() || request.items.len() as i64 > CLAIM_MAX {
         return Err(Error::invalid(format!(
             "`{}` results, 1 to {CLAIM_MAX} are possible",

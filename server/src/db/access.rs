@@ -175,9 +175,20 @@ impl Store {
     /// # Errors
     /// When the database refuses.
     pub async fn projects(&self) -> Result<Vec<Project>> {
-        let rows = self.query("SELECT name, share, running_max FROM project ORDER BY name", vec![]).await?;
+        let rows = self
+            .query(
+                "SELECT name, share, running_max, retention_days, outputs_days FROM project ORDER BY name",
+                vec![],
+            )
+            .await?;
         let project = |row: &Row| {
-            Ok(Project { name: row.text(0)?, share: row.int(1)?, running_max: row.int_or_null(2)? })
+            Ok(Project {
+                name: row.text(0)?,
+                share: row.int(1)?,
+                running_max: row.int_or_null(2)?,
+                retention_days: row.int_or_null(3)?,
+                outputs_days: row.int_or_null(4)?,
+            })
         };
         rows.iter().map(project).collect()
     }
@@ -188,9 +199,12 @@ impl Store {
     /// When the database refuses.
     pub async fn put_project(&self, project: &Project) -> Result<()> {
         let mut tx = self.begin().await?;
-        let sql = "INSERT INTO project (name, share, running_max) VALUES ($1, $2, $3)
-            ON CONFLICT (name) DO UPDATE SET share = $2, running_max = $3";
-        tx.execute(sql.into(), values![&project.name, project.share, project.running_max]).await?;
+        let sql = "INSERT INTO project (name, share, running_max, retention_days, outputs_days)
+            VALUES ($1, $2, $3, COALESCE($4, 14), $5)
+            ON CONFLICT (name) DO UPDATE SET share = $2, running_max = $3,
+                retention_days = COALESCE($4, project.retention_days), outputs_days = COALESCE($5, project.outputs_days)";
+        let Project { name, share, running_max, retention_days, outputs_days } = project;
+        tx.execute(sql.into(), values![name, *share, *running_max, *retention_days, *outputs_days]).await?;
         self.commit("project", tx).await
     }
 

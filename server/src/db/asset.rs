@@ -1,9 +1,18 @@
 //! Which projects have uploaded which assets, and which parts a pass has committed.
 
+use std::collections::BTreeSet;
+
+use protocol::job::JobRequest;
+use protocol::keys;
 use protocol::work::{PartEntry, PartPage};
 
-use super::Store;
-use crate::{Result, values};
+use super::{Store, Tx, placeholders};
+use crate::error::Kind;
+use crate::storage::sha256;
+use crate::{Error, Result, values};
+
+/// Hashes of one statement.
+const ROWS: usize = 500;
 
 impl Store {
     /// The hashes among `hashes` that the project has not uploaded.
@@ -12,8 +21,8 @@ impl Store {
     /// When the database refuses.
     pub async fn missing_assets(&self, project: &str, hashes: &[String]) -> Result<Vec<String>> {
         let mut missing = Vec::new();
-        for chunk in hashes.chunks(500) {
-            let list = super::placeholders(2, chunk.len());
+        for chunk in hashes.chunks(ROWS) {
+            let list = placeholders(2, chunk.len());
             let sql = format!("SELECT sha256 FROM asset WHERE project = $1 AND sha256 IN ({list})");
             let mut values = values![project];
             values.extend(chunk.iter().map(Into::into));
@@ -30,8 +39,8 @@ impl Store {
     /// When the database refuses.
     pub async fn asset_bytes(&self, project: &str, hashes: &[String]) -> Result<i64> {
         let mut bytes = 0;
-        for chunk in hashes.chunks(500) {
-            let list = super::placeholders(2, chunk.len());
+        for chunk in hashes.chunks(ROWS) {
+            let list = placeholders(2, chunk.len());
             let sql = format!(
                 "SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM asset WHERE project = $1 AND sha256 IN ({list})"
             );
@@ -45,12 +54,74 @@ impl Store {
     /// Notes that the project has uploaded an asset.
     ///
     /// # Errors
-    /// When the database refuses.
+    /// [`Kind::Unavailable`] while the object is being removed because nobody referred to it: the upload must be repeated.
     pub async fn add_asset(&self, project: &str, sha256: &str, bytes: i64, now: i64) -> Result<()> {
         let mut tx = self.begin().await?;
-        let sql = "INSERT INTO asset (project, sha256, bytes, created_at) VALUES ($1, $2, $3, $4) ON CONFLICT DO NOTHING";
+        self.serialise_assets(&mut tx).await?;
+        let going =
+            tx.query("SELECT 1 FROM garbage WHERE key = $1".into(), values![keys::asset(sha256)]).await?;
+        if !going.is_empty() {
+            return Err(Error::new(Kind::Unavailable, "the asset is being removed: send it again"));
+        }
+        let sql =
+            "INSERT INTO asset (project, sha256, bytes, created_at, used_at) VALUES ($1, $2, $3, $4, $4)
+            ON CONFLICT (project, sha256) DO UPDATE SET used_at = $4";
         tx.execute(sql.into(), values![project, sha256, bytes, now]).await?;
         self.commit("asset", tx).await
+    }
+
+    /// Takes back that the project has an asset.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn forget_asset(&self, project: &str, sha256: &str) -> Result<()> {
+        let mut tx = self.begin().await?;
+        let sql = "DELETE FROM asset WHERE project = $1 AND sha256 = $2";
+        tx.execute(sql.into(), values![project, sha256]).await?;
+        self.commit("asset", tx).await
+    }
+
+    /// Makes jobs to be of this request refer to its files; the set of them.
+    pub(super) async fn refer_to_files(
+        &self,
+        tx: &mut Tx,
+        request: &JobRequest,
+        now: i64,
+    ) -> Result<Option<String>> {
+        let hashes: BTreeSet<&String> = request.files.values().collect();
+        if hashes.is_empty() {
+            return Ok(None);
+        }
+        self.serialise_assets(tx).await?;
+        let hashes: Vec<&String> = hashes.into_iter().collect();
+        let set = sha256(&serde_json::to_vec(&hashes)?);
+        for chunk in hashes.chunks(ROWS) {
+            let list = placeholders(3, chunk.len());
+            let sql = format!("UPDATE asset SET used_at = $2 WHERE project = $1 AND sha256 IN ({list})");
+            let mut values = values![&request.project, now];
+            values.extend(chunk.iter().map(|&hash| hash.into()));
+            // They were there when the request was checked; a removal may have come between
+            if tx.execute(sql.into(), values).await? != chunk.len() as u64 {
+                return Err(Error::new(Kind::Conflict, "files of the scene are not uploaded any more")
+                    .hint("ask `POST /v1/assets/missing`, then `PUT /v1/assets/{sha256}`"));
+            }
+            let rows = (2..2 + chunk.len()).map(|number| format!("($1, ${number})")).collect::<Vec<_>>();
+            let sql = format!(
+                "INSERT INTO file_set (id, sha256) VALUES {} ON CONFLICT DO NOTHING",
+                rows.join(", ")
+            );
+            let mut values = values![&set];
+            values.extend(chunk.iter().map(|&hash| hash.into()));
+            tx.execute(sql.into(), values).await?;
+        }
+        Ok(Some(set))
+    }
+
+    pub(super) async fn serialise_assets(&self, tx: &mut Tx) -> Result<()> {
+        if let Some(sql) = self.dialect().serialise_assets {
+            tx.query(sql.into(), vec![]).await?;
+        }
+        Ok(())
     }
 
     /// The committed parts of a pass after batch `after`, up to `limit`.

@@ -7,6 +7,7 @@ use protocol::limits::{MESSAGE_BYTES_MAX, cut};
 use protocol::work::{ClaimedBatch, CompleteItem, Outcome, Verdict};
 use protocol::{BatchState, FailureClass, PassKind, PassState, keys};
 
+use super::opinion::{Distrusted, OPINION};
 use super::{Store, Tx, placeholders};
 use crate::scheduler::failure::{self, Around, History, Ruling};
 use crate::{Result, values};
@@ -24,6 +25,8 @@ pub struct Reporter<'a> {
     pub worker: &'a str,
     /// The time and the farm.
     pub around: Around,
+    /// One result in so many is to be confirmed by another worker; none where this is 0.
+    pub opinion_every: u32,
 }
 
 /// What came of a report.
@@ -53,6 +56,8 @@ pub struct Completion {
     pub blames: bool,
     /// Why the job was paused, if it was.
     pub storm: Option<String>,
+    /// Workers that are not believed any more.
+    pub distrusted: Vec<Distrusted>,
 }
 
 /// The lease and pass that a report is about.
@@ -89,7 +94,9 @@ impl Store {
         if context.state == PassState::Cancelled {
             self.complete_cancelled(&mut tx, &context, items, &mut completion, &mut tally).await?;
         } else {
-            self.complete_done(&mut tx, &context, items, &mut completion, &mut tally).await?;
+            let held = self.question(&mut tx, reporter, &context, items, &mut completion, &mut tally).await?;
+            let counting = (&context, reporter.worker, &held[..]);
+            self.complete_done(&mut tx, counting, items, &mut completion, &mut tally).await?;
             self.complete_failed(&mut tx, reporter, &context, items, &mut completion, &mut tally).await?;
         }
         self.settle(&mut tx, &context, &tally, &mut completion).await?;
@@ -149,18 +156,18 @@ impl Store {
         Ok(())
     }
 
-    /// Accepts results, all with one statement.
+    /// Accepts results of a worker but those that are held back, all with one statement.
     async fn complete_done(
         &self,
         tx: &mut Tx,
-        context: &Context,
+        (context, worker, held): (&Context, &str, &[i64]),
         items: &[CompleteItem],
         completion: &mut Completion,
         tally: &mut Tally,
     ) -> Result<()> {
-        let mut values = values![context.pass, &context.lease];
+        let mut values = values![context.pass, &context.lease, worker];
         let mut rows = Vec::new();
-        for item in items {
+        for item in items.iter().filter(|item| !held.contains(&item.batch)) {
             let Outcome::Done { sha256, bytes, .. } = &item.outcome else { continue };
             rows.push(format!("({})", placeholders(values.len() + 1, 4)));
             values.extend(values![item.batch, item.fence, sha256, *bytes]);
@@ -169,7 +176,7 @@ impl Store {
             return Ok(());
         }
         let sql = format!(
-            "UPDATE batch SET state = 2, sha256 = v.column3, bytes = v.column4, lease_id = NULL
+            "UPDATE batch SET state = 2, sha256 = v.column3, bytes = v.column4, worker = $3, lease_id = NULL
             FROM (VALUES {}) AS v
             WHERE batch.pass_id = $1 AND batch.seq = v.column1 AND batch.fence = v.column2
                 AND batch.state = 1 AND batch.lease_id = $2
@@ -278,10 +285,10 @@ impl Store {
 
     /// The failures of a batch so far.
     async fn history(&self, tx: &mut Tx, pass: i64, batch: i64) -> Result<History> {
-        let sql = "SELECT worker, class, n, first_at FROM batch_fault WHERE pass_id = $1 AND seq = $2";
+        let sql = "SELECT worker, class, n, first_at FROM batch_fault WHERE pass_id = $1 AND seq = $2 AND class <> $3";
         let mut history = History::default();
         let mut workers: Vec<String> = Vec::new();
-        for row in tx.query(sql.into(), values![pass, batch]).await? {
+        for row in tx.query(sql.into(), values![pass, batch, OPINION]).await? {
             let class = row.word(1, FailureClass::from_code)?;
             let worker = row.text(0)?;
             match class {

@@ -76,7 +76,7 @@ impl Store {
     /// [`Kind::NotFound`], [`Kind::Conflict`] when the job has succeeded or was cancelled.
     pub async fn retry(&self, job: &str, selection: &BatchSelection, actor: &str, now: i64) -> Result<i64> {
         let mut tx = self.begin().await?;
-        let state = self.lock_job(&mut tx, job).await?;
+        let state = self.lock_whole(&mut tx, job).await?;
         if matches!(state, JobState::Succeeded | JobState::Cancelled | JobState::Cancelling) {
             let message = format!("the job has {state}: its batches cannot be tried again");
             return Err(Error::new(Kind::Conflict, message).hint("submit it again"));
@@ -94,8 +94,7 @@ impl Store {
 
     /// Brings a failed job back: passes of which batches are to run are open again, later ones wait again.
     async fn reopen(&self, tx: &mut Tx, job: &str) -> Result<()> {
-        let sql =
-            "UPDATE job SET state = $2, reason = '', ended_at = NULL, version = version + 1 WHERE id = $1";
+        let sql = "UPDATE job SET state = $2, reason = '', ended_at = NULL, attempts_marked = 0, version = version + 1 WHERE id = $1";
         tx.execute(sql.into(), values![job, JobState::Running.code()]).await?;
         // A pass that was closed while its batches were being created goes on being created
         let sql = "UPDATE pass SET ended_at = NULL, state = CASE
@@ -121,7 +120,7 @@ impl Store {
     /// [`Kind::NotFound`], [`Kind::Conflict`] when the job is at its end and has not failed.
     pub async fn skip(&self, job: &str, selection: &BatchSelection, actor: &str, now: i64) -> Result<i64> {
         let mut tx = self.begin().await?;
-        let state = self.lock_job(&mut tx, job).await?;
+        let state = self.lock_whole(&mut tx, job).await?;
         if state.is_final() && state != JobState::Failed {
             let message = format!("the job has {state}: nothing of it can be skipped");
             return Err(Error::new(Kind::Conflict, message));
@@ -199,8 +198,19 @@ impl Store {
         self.commit("patch", tx).await
     }
 
-    async fn lock_job(&self, tx: &mut Tx, job: &str) -> Result<JobState> {
-        let sql = format!("SELECT state FROM job WHERE id = $1{}", self.dialect().lock);
+    /// Locks a job whose batches are all there.
+    async fn lock_whole(&self, tx: &mut Tx, job: &str) -> Result<JobState> {
+        let state = self.lock_job(tx, job).await?;
+        let gone = tx.query("SELECT 1 FROM job WHERE id = $1 AND work_gone > 0".into(), values![job]).await?;
+        if !gone.is_empty() {
+            return Err(Error::new(Kind::Conflict, "the job is past its retention: its batches are gone")
+                .hint("submit its scene anew"));
+        }
+        Ok(state)
+    }
+
+    pub(super) async fn lock_job(&self, tx: &mut Tx, job: &str) -> Result<JobState> {
+        let sql = format!("SELECT state FROM job WHERE id = $1 AND deleted = 0{}", self.dialect().lock);
         let rows = tx.query(sql.into(), values![job]).await?;
         rows.first().ok_or_else(|| Error::not_found("job", job))?.word(0, JobState::from_code)
     }

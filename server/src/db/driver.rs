@@ -133,6 +133,8 @@ pub struct Dialect {
     pub lock_s_skip: &'static str,
     /// Makes the transaction wait until no other writes events, so that their ids rise in the order of commits.
     pub serialise_events: Option<&'static str>,
+    /// Makes the transaction wait until no other adds assets or removes some.
+    pub serialise_assets: Option<&'static str>,
 }
 
 /// SQL: written here, or put together here from such; never from what came over the wire.

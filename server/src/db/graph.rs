@@ -246,16 +246,24 @@ impl Store {
                 self.set_pass_state(tx, row.int(0)?, PassState::Done, Some(now)).await?;
                 advance.others.push(row.text(1)?);
             }
-        } else if let Some(heir) = waiting.first() {
-            let heir = heir.int(0)?;
-            let sql = "UPDATE artifact SET pass_id = $2 WHERE key = $1";
-            tx.execute(sql.into(), values![&build.name, heir]).await?;
-            self.create_batches(tx, heir, 0, 1, SEGMENT.0).await?;
-            let sql = "UPDATE pass SET state = $2, reused = 0 WHERE id = $1";
-            tx.execute(sql.into(), values![heir, PassState::Open.code()]).await?;
         } else {
-            tx.execute("DELETE FROM artifact WHERE key = $1".into(), values![&build.name]).await?;
+            let heir = waiting.first().map(|row| row.int(0)).transpose()?;
+            self.bequeath(tx, &build.name, heir).await?;
         }
+        Ok(())
+    }
+
+    /// Lets a pass build an artifact that nobody builds any more; where there is none, the artifact is forgotten.
+    pub(super) async fn bequeath(&self, tx: &mut Tx, key: &str, heir: Option<i64>) -> Result<()> {
+        let Some(heir) = heir else {
+            tx.execute("DELETE FROM artifact WHERE key = $1".into(), values![key]).await?;
+            return Ok(());
+        };
+        let sql = "UPDATE artifact SET pass_id = $2 WHERE key = $1";
+        tx.execute(sql.into(), values![key, heir]).await?;
+        self.create_batches(tx, heir, 0, 1, SEGMENT.0).await?;
+        let sql = "UPDATE pass SET state = $2, reused = 0 WHERE id = $1";
+        tx.execute(sql.into(), values![heir, PassState::Open.code()]).await?;
         Ok(())
     }
 

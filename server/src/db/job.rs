@@ -40,8 +40,7 @@ impl Store {
         key: &str,
         request_sha256: &str,
     ) -> Result<Option<Vec<String>>> {
-        let sql =
-            "SELECT id, request_sha256 FROM job WHERE project = $1 AND idempotency_key = $2 ORDER BY id";
+        let sql = "SELECT id, request_sha256 FROM job WHERE project = $1 AND idempotency_key = $2 AND deleted = 0 ORDER BY id";
         let rows = self.query(sql, values![project, key]).await?;
         same_request(key, request_sha256, &rows)
     }
@@ -60,25 +59,25 @@ impl Store {
             return Err(Error::not_found("project", project));
         }
         if let Some(key) = &first.idempotency_key {
-            let sql =
-                "SELECT id, request_sha256 FROM job WHERE project = $1 AND idempotency_key = $2 ORDER BY id";
+            let sql = "SELECT id, request_sha256 FROM job WHERE project = $1 AND idempotency_key = $2 AND deleted = 0 ORDER BY id";
             let rows = tx.query(sql.into(), values![project, key]).await?;
             if let Some(known) = same_request(key, &first.request_sha256, &rows)? {
                 return Ok(known);
             }
         }
+        let file_set = self.refer_to_files(&mut tx, &first.request, now).await?;
         for job in jobs {
-            self.insert(&mut tx, job, now).await?;
+            self.insert(&mut tx, job, file_set.as_deref(), now).await?;
         }
         self.commit("submit", tx).await?;
         Ok(jobs.iter().map(|job| job.id.clone()).collect())
     }
 
-    async fn insert(&self, tx: &mut Tx, job: &NewJob, now: i64) -> Result<()> {
+    async fn insert(&self, tx: &mut Tx, job: &NewJob, file_set: Option<&str>, now: i64) -> Result<()> {
         let request = &job.request;
         let mut blocked = false;
         for needed in &request.depends_on {
-            let sql = "SELECT state FROM job WHERE id = $1 AND project = $2";
+            let sql = "SELECT state FROM job WHERE id = $1 AND project = $2 AND deleted = 0";
             let rows = tx.query(sql.into(), values![needed, &request.project]).await?;
             let row = rows.first().ok_or_else(|| Error::not_found("job", needed))?;
             match row.word(0, JobState::from_code)? {
@@ -95,8 +94,9 @@ impl Store {
         let state = if blocked { JobState::Blocked } else { JobState::Ready };
         let reason = if blocked { "another job must succeed before" } else { "" };
         let sql = "INSERT INTO job (id, project, name, state, paused, reason, priority, running_max, failed_max,
-                partial, request, request_sha256, idempotency_key, shot, comment, frame, submitted_by, resubmit_of, created_at)
-            VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16, $17, $18, $19)";
+                partial, request, request_sha256, idempotency_key, shot, comment, frame, submitted_by, resubmit_of, created_at,
+                file_set)
+            VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16, $17, $18, $19, $20)";
         tx.execute(
             sql.into(),
             values![
@@ -119,6 +119,7 @@ impl Store {
                 &job.submitted_by,
                 job.resubmit_of.clone(),
                 now,
+                file_set,
             ],
         )
         .await?;

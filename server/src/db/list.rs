@@ -62,7 +62,7 @@ pub struct JobList<'a> {
 }
 
 /// Which jobs a list has: parameters 1 to 4 are project, state, search and cursor.
-const WHERE: &str = "($1 = '' OR project = $1) AND ($2 = -1 OR state = $2) AND id < $4 AND ($3 = ''
+const WHERE: &str = "deleted = 0 AND ($1 = '' OR project = $1) AND ($2 = -1 OR state = $2) AND id < $4 AND ($3 = ''
     OR LOWER(name) LIKE $3 ESCAPE '!' OR LOWER(submitted_by) LIKE $3 ESCAPE '!' OR LOWER(shot) LIKE $3 ESCAPE '!'
     OR LOWER(comment) LIKE $3 ESCAPE '!' OR LOWER(id) LIKE $3 ESCAPE '!')";
 
@@ -112,7 +112,7 @@ impl Store {
     /// # Errors
     /// When the database refuses.
     pub async fn count_jobs(&self, project: Option<&str>, state: JobState) -> Result<i64> {
-        let sql = "SELECT COUNT(*) FROM job WHERE state = $1 AND ($2 = '' OR project = $2)";
+        let sql = "SELECT COUNT(*) FROM job WHERE deleted = 0 AND state = $1 AND ($2 = '' OR project = $2)";
         let row = self.query_one(sql, values![state.code(), project.unwrap_or_default()]).await?;
         row.map_or(Ok(0), |row| row.int(0))
     }

@@ -5,7 +5,7 @@ use crate::error::Kind;
 use crate::{Error, Result, values};
 
 /// For each version, from 1: SQLite's script and PostgreSQL's.
-const MIGRATIONS: [(&str, &str); 3] = [
+const MIGRATIONS: [(&str, &str); 5] = [
     (
         include_str!("../../../migrations/sqlite/0001_queue.sql"),
         include_str!("../../../migrations/postgres/0001_queue.sql"),
@@ -18,7 +18,31 @@ const MIGRATIONS: [(&str, &str); 3] = [
         include_str!("../../../migrations/sqlite/0003_work.sql"),
         include_str!("../../../migrations/postgres/0003_work.sql"),
     ),
+    (
+        include_str!("../../../migrations/sqlite/0004_retention.sql"),
+        include_str!("../../../migrations/postgres/0004_retention.sql"),
+    ),
+    (
+        include_str!("../../../migrations/sqlite/0005_trust.sql"),
+        include_str!("../../../migrations/postgres/0005_trust.sql"),
+    ),
 ];
+
+/// The version that this program wants.
+pub(super) const LATEST: i64 = MIGRATIONS.len() as i64;
+
+/// The version that the database has; none where it has no schema.
+pub(super) async fn version(store: &Store) -> Result<Option<i64>> {
+    let is_there = match store.dialect().name {
+        "postgres" => "SELECT 1 WHERE to_regclass('schema_meta') IS NOT NULL",
+        _ => "SELECT 1 FROM sqlite_master WHERE name = 'schema_meta'",
+    };
+    if store.query_one(is_there, vec![]).await?.is_none() {
+        return Ok(None);
+    }
+    let row = store.query_one("SELECT version FROM schema_meta", vec![]).await?;
+    row.map(|row| row.int(0)).transpose()
+}
 
 /// Takes the steps that are missing, each in one transaction.
 pub(super) async fn run(store: &Store) -> Result<()> {
@@ -32,10 +56,9 @@ pub(super) async fn run(store: &Store) -> Result<()> {
         }
         let found = tx.query("SELECT version FROM schema_meta".into(), vec![]).await?;
         let found = found.first().map(|row| row.int(0)).transpose()?;
-        let latest = MIGRATIONS.len() as i64;
-        if found.unwrap_or(0) > latest {
+        if found.unwrap_or(0) > LATEST {
             let message =
-                format!("the database has schema version `{}`, `{latest}` wanted", found.unwrap_or(0));
+                format!("the database has schema version `{}`, `{LATEST}` wanted", found.unwrap_or(0));
             return Err(Error::new(Kind::Conflict, message).hint("use the newer program"));
         }
         let version = number as i64 + 1;

@@ -12,14 +12,17 @@ pub mod control;
 pub mod driver;
 pub mod event;
 pub mod farm;
+pub mod garbage;
 pub mod graph;
 pub mod job;
 pub mod lease;
 pub mod list;
 mod migrate;
+pub mod opinion;
 #[cfg(test)]
 mod plans;
 pub mod postgres;
+pub mod retention;
 pub mod sqlite;
 pub mod truth;
 pub mod view;
@@ -43,6 +46,9 @@ pub struct Store {
 pub type Tx = Box<dyn Transaction>;
 
 impl Store {
+    /// The schema's version that this program wants.
+    pub const SCHEMA_VERSION: i64 = migrate::LATEST;
+
     /// Opens the database at `url`: `sqlite:PATH` or `postgres://…`, of up to `connections` connections.
     ///
     /// # Errors
@@ -69,6 +75,14 @@ impl Store {
     /// When the schema is newer, or the database refuses.
     pub async fn migrate(&self) -> Result<()> {
         migrate::run(self).await
+    }
+
+    /// The schema's version in the database; none where there is no schema yet.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn schema_version(&self) -> Result<Option<i64>> {
+        migrate::version(self).await
     }
 
     /// Where the database differs from others.

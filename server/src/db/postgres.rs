@@ -77,6 +77,7 @@ impl Driver for PostgresDriver {
             lock: " FOR UPDATE",
             lock_s_skip: " FOR UPDATE OF s SKIP LOCKED",
             serialise_events: Some("SELECT CAST(COUNT(pg_advisory_xact_lock(1886544240)) AS BIGINT)"),
+            serialise_assets: Some("SELECT CAST(COUNT(pg_advisory_xact_lock(1886544241)) AS BIGINT)"),
         }
     }
 

@@ -136,7 +136,7 @@ fn row(row: &SqliteRow) -> Result<Row> {
 impl Driver for SqliteDriver {
     fn dialect(&self) -> Dialect {
         // A transaction that writes has the file to itself
-        Dialect { name: "sqlite", lock: "", lock_s_skip: "", serialise_events: None }
+        Dialect { name: "sqlite", lock: "", lock_s_skip: "", serialise_events: None, serialise_assets: None }
     }
 
     async fn begin(&self) -> Result<Box<dyn Transaction>> {

@@ -12,14 +12,18 @@ use crate::{Error, Result, values};
 pub(super) const SUMMARY: &str =
     "SELECT j.id, j.name, j.project, j.state, j.paused, j.reason, j.priority, j.submitted_by, j.shot,
     j.frame, j.comment, j.created_at, j.started_at, j.ended_at, j.version,
-    COALESCE(c.r, 0), COALESCE(c.l, 0), COALESCE(c.d, 0), COALESCE(c.f, 0), COALESCE(c.k, 0)";
+    COALESCE(c.r, 0), COALESCE(c.l, 0), COALESCE(c.d, 0), COALESCE(c.f, 0), COALESCE(c.k, 0), j.work_gone";
 
 /// The counts of the bake passes of the jobs in a list.
-pub(super) const COUNTS: &str = "LEFT JOIN (SELECT p.job_id AS job, CAST(SUM(s.n_ready) AS BIGINT) AS r,
-        CAST(SUM(s.n_leased) AS BIGINT) AS l, CAST(SUM(s.n_done) AS BIGINT) AS d,
-        CAST(SUM(s.n_failed) AS BIGINT) AS f, CAST(SUM(s.n_skipped) AS BIGINT) AS k
-    FROM pass p JOIN segment s ON s.pass_id = p.id WHERE p.kind = 3 AND p.job_id IN (SELECT id FROM page)
-    GROUP BY p.job_id) AS c ON c.job = j.id";
+pub(super) const COUNTS: &str = "LEFT JOIN (SELECT p.job_id AS job, CAST(SUM(COALESCE(s.r, 0)) AS BIGINT) AS r,
+        CAST(SUM(COALESCE(s.l, 0)) AS BIGINT) AS l, CAST(SUM(p.kept_done + COALESCE(s.d, 0)) AS BIGINT) AS d,
+        CAST(SUM(p.kept_failed + COALESCE(s.f, 0)) AS BIGINT) AS f,
+        CAST(SUM(p.kept_skipped + COALESCE(s.k, 0)) AS BIGINT) AS k
+    FROM pass p LEFT JOIN (SELECT pass_id, SUM(n_ready) AS r, SUM(n_leased) AS l, SUM(n_done) AS d, SUM(n_failed) AS f,
+            SUM(n_skipped) AS k
+        FROM segment WHERE pass_id IN (SELECT id FROM pass WHERE kind = 3 AND job_id IN (SELECT id FROM page))
+        GROUP BY pass_id) AS s ON s.pass_id = p.id
+    WHERE p.kind = 3 AND p.job_id IN (SELECT id FROM page) GROUP BY p.job_id) AS c ON c.job = j.id";
 
 pub(super) fn summary(row: &Row) -> Result<JobSummary> {
     Ok(JobSummary {
@@ -39,6 +43,7 @@ pub(super) fn summary(row: &Row) -> Result<JobSummary> {
         ended_at: row.int_or_null(13)?,
         version: row.int(14)?,
         batches: counts(row, 15)?,
+        pruned: row.flag(20)?,
     })
 }
 
@@ -59,7 +64,7 @@ impl Store {
     /// [`NotFound`](crate::error::Kind::NotFound).
     pub async fn job(&self, job: &str) -> Result<JobSummary> {
         let sql = format!(
-            "WITH page AS (SELECT id FROM job WHERE id = $1) {SUMMARY} FROM page JOIN job j ON j.id = page.id {COUNTS}"
+            "WITH page AS (SELECT id FROM job WHERE id = $1 AND deleted = 0) {SUMMARY} FROM page JOIN job j ON j.id = page.id {COUNTS}"
         );
         let row = self.query_one(sql, values![job]).await?;
         summary(&row.ok_or_else(|| Error::not_found("job", job))?)
@@ -81,11 +86,13 @@ impl Store {
     pub async fn pass_details(&self, job: &str) -> Result<Vec<PassDetail>> {
         let sql = "SELECT p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result,
                 CAST(COALESCE(SUM(s.n_ready), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_leased), 0) AS BIGINT),
-                CAST(COALESCE(SUM(s.n_done), 0) AS BIGINT), CAST(COALESCE(SUM(s.n_failed), 0) AS BIGINT),
-                CAST(COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
+                CAST(p.kept_done + COALESCE(SUM(s.n_done), 0) AS BIGINT),
+                CAST(p.kept_failed + COALESCE(SUM(s.n_failed), 0) AS BIGINT),
+                CAST(p.kept_skipped + COALESCE(SUM(s.n_skipped), 0) AS BIGINT),
                 CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT)
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
-            GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result ORDER BY p.id";
+            GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result, p.kept_done, p.kept_failed,
+                p.kept_skipped ORDER BY p.id";
         let pass = |row: &Row| {
             Ok(PassDetail {
                 id: row.int(0)?,
@@ -160,7 +167,7 @@ impl Store {
         after: i64,
         limit: i64,
     ) -> Result<BatchPage> {
-        let sql = "SELECT b.seq, b.state, b.fence, b.tries, l.worker, b.sha256 FROM batch b JOIN pass p ON p.id = b.pass_id
+        let sql = "SELECT b.seq, b.state, b.fence, b.tries, COALESCE(l.worker, b.worker), b.sha256 FROM batch b JOIN pass p ON p.id = b.pass_id
             LEFT JOIN lease l ON l.id = b.lease_id
             WHERE b.pass_id = $1 AND p.job_id = $2 AND b.seq > $3 AND ($4 = -1 OR b.state = $4) ORDER BY b.seq LIMIT $5";
         let batch = |row: &Row| {
@@ -187,7 +194,7 @@ impl Store {
     pub async fn failures(&self, job: &str, limit: i64) -> Result<Vec<Failure>> {
         let sql =
             "SELECT f.pass_id, f.seq, f.fence, f.worker, f.class, f.n, f.message, f.at FROM batch_fault f
-            WHERE f.pass_id IN (SELECT id FROM pass WHERE job_id = $1) ORDER BY f.at DESC, f.seq LIMIT $2";
+            WHERE f.pass_id IN (SELECT id FROM pass WHERE job_id = $1) AND f.class <> $3 ORDER BY f.at DESC, f.seq LIMIT $2";
         let failure = |row: &Row| {
             Ok(Failure {
                 pass: row.int(0)?,
@@ -200,7 +207,7 @@ impl Store {
                 at: row.int(7)?,
             })
         };
-        self.query(sql, values![job, limit]).await?.iter().map(failure).collect()
+        self.query(sql, values![job, limit, super::opinion::OPINION]).await?.iter().map(failure).collect()
     }
 
     /// All workers, by name.
@@ -210,7 +217,8 @@ impl Store {
     pub async fn workers(&self, now: i64) -> Result<Vec<WorkerDetail>> {
         let sql = "SELECT w.name, w.labels, w.memory_bytes, w.version, w.locked, w.draining, w.sick_until, w.last_seen,
                 CAST(COALESCE((SELECT SUM(l.n) FROM lease l WHERE l.worker = w.name), 0) AS BIGINT),
-                (SELECT COUNT(*) FROM batch_fault f WHERE f.worker = w.name AND f.class IN (3, 7) AND f.at > $1)
+                (SELECT COUNT(*) FROM batch_fault f WHERE f.worker = w.name AND f.class IN (3, 7) AND f.at > $1),
+                w.reason
             FROM worker w ORDER BY w.name LIMIT 10000";
         let rows = self.query(sql, values![now - crate::scheduler::failure::SICK_MS]).await?;
         let worker = |row: &Row| {
@@ -231,6 +239,7 @@ impl Store {
                 version: row.text(3)?,
                 leased,
                 errors: row.int(9)?,
+                reason: row.text(10)?,
                 last_seen,
             })
         };

@@ -119,7 +119,7 @@ impl Store {
         let sql = match action {
             WorkerAction::Lock => "UPDATE worker SET locked = 1 WHERE name = $1",
             WorkerAction::Unlock => {
-                "UPDATE worker SET locked = 0, draining = 0, sick_until = 0 WHERE name = $1"
+                "UPDATE worker SET locked = 0, reason = '', draining = 0, sick_until = 0 WHERE name = $1"
             }
             WorkerAction::Drain => "UPDATE worker SET draining = 1 WHERE name = $1",
         };

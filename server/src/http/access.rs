@@ -136,6 +136,7 @@ pub async fn guard(State(api): State<Arc<Api>>, mut request: Request, next: Next
             action: protocol::limits::cut(&action, 500).into(),
             status: i64::from(response.status().as_u16()),
         };
+        tracing::info!(actor = entry.actor, action = entry.action, status = entry.status, "a change");
         if let Err(error) = api.coordinator.store.add_audit(&entry).await {
             tracing::error!(%error, actor = entry.actor, action, "a change could not be written to the audit");
         }

@@ -114,7 +114,7 @@ fn expiry(seconds: i64, now: i64) -> Result<i64> {
 }
 
 /// An administrator of one project has no say over tokens, tickets and projects.
-fn confined(caller: &Caller) -> Result<()> {
+pub fn confined(caller: &Caller) -> Result<()> {
     match caller.project() {
         None => Ok(()),
         Some(project) => {
@@ -226,10 +226,15 @@ pub async fn put_project(
     Json(project): Json<Project>,
 ) -> Result<Json<Project>> {
     confined(&caller)?;
-    let possible = (1..=1_000_000).contains(&project.share) && project.running_max.is_none_or(|max| max >= 0);
+    let possible = (1..=1_000_000).contains(&project.share)
+        && project.running_max.is_none_or(|max| max >= 0)
+        && [project.retention_days, project.outputs_days]
+            .iter()
+            .flatten()
+            .all(|days| (0..=36_500).contains(days));
     if name != project.name || !limits::is_name(&name) || !possible {
         return Err(Error::invalid(
-            "a project has the name of its path, a share from 1 to 1000000, and `running_max` 0 or more",
+            "a project has the name of its path, a share from 1 to 1000000, `running_max` 0 or more, and days up to 36500",
         ));
     }
     api.coordinator.store.put_project(&project).await?;

@@ -14,6 +14,7 @@ use utoipa::IntoParams;
 use super::Api;
 use super::access::Caller;
 use super::extract::{Json, Path, Query, range};
+use crate::error::Kind;
 use crate::storage::{Expected, Outgoing};
 use crate::{Error, Result};
 
@@ -76,6 +77,11 @@ pub async fn put_asset(
     let expected = Expected { sha256: &sha256, bytes: None, bytes_max };
     let bytes = coordinator.storage.receive(&keys::asset(&sha256), body, expected).await?;
     coordinator.store.add_asset(project, &sha256, bytes as i64, coordinator.now()).await?;
+    // A removal that was under way while the bytes came may have taken them, too
+    if coordinator.storage.bytes(&keys::asset(&sha256)).await?.is_none() {
+        coordinator.store.forget_asset(project, &sha256).await?;
+        return Err(Error::new(Kind::Unavailable, "the asset is being removed: send it again"));
+    }
     Ok(StatusCode::NO_CONTENT)
 }
 

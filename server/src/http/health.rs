@@ -6,6 +6,8 @@ use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
+use protocol::FailureClass;
+use protocol::gc::GcKind;
 
 use super::Api;
 use crate::error::Kind;
@@ -25,9 +27,45 @@ pub fn metrics_handle() -> PrometheusHandle {
         // Another library's recorder may be there: then these figures stay empty
         let _ = metrics::set_global_recorder(recorder);
         metrics::gauge!("pantaray_build_info", "version" => env!("CARGO_PKG_VERSION")).set(1.0);
+        begin_at_zero();
         handle
     };
     HANDLE.get_or_init(install).clone()
+}
+
+/// Counters are there before they count: a rate over what is not there is nothing, and an alert on it sleeps.
+fn begin_at_zero() {
+    let classes: Vec<&str> = FailureClass::ALL.iter().map(|class| class.word()).collect();
+    let labelled: [(&'static str, &'static str, &[&str]); 4] = [
+        ("pantaray_claims_total", "result", &["granted", "empty"]),
+        ("pantaray_claims_locality_total", "kind", &["own", "warm", "adjacent", "steal", "cold"]),
+        (
+            "pantaray_completions_total",
+            "outcome",
+            &["accepted", "already_done", "superseded", "cancelled", "rejected"],
+        ),
+        ("pantaray_batch_failures_total", "class", &classes),
+    ];
+    for (name, label, words) in labelled {
+        for word in words {
+            metrics::counter!(name, label => (*word).to_owned()).increment(0);
+        }
+    }
+    for outcome in ["asked", "agreed", "split", "counted"] {
+        metrics::counter!("pantaray_second_opinions_total", "outcome" => outcome).increment(0);
+    }
+    for kind in GcKind::ALL {
+        metrics::counter!("pantaray_gc_deleted_total", "kind" => kind.word()).increment(0);
+        metrics::counter!("pantaray_gc_deleted_bytes_total", "kind" => kind.word()).increment(0);
+    }
+    for name in [
+        "pantaray_leases_expired_total",
+        "pantaray_worker_sick_total",
+        "pantaray_workers_distrusted_total",
+        "pantaray_output_divergence_total",
+    ] {
+        metrics::counter!(name).increment(0);
+    }
 }
 
 /// The process runs.

@@ -7,12 +7,14 @@ mod admin;
 mod bytes;
 mod events;
 mod extract;
+mod gc;
 mod health;
 mod jobs;
 mod overview;
 mod session;
 #[cfg(test)]
 mod tests;
+mod trace;
 mod work;
 
 use std::collections::BTreeMap;
@@ -67,13 +69,14 @@ fn operations() -> OpenApiRouter<Arc<Api>> {
         // Jobs
         .routes(routes!(jobs::submit, jobs::jobs))
         .routes(routes!(jobs::validate))
-        .routes(routes!(jobs::job, jobs::patch))
+        .routes(routes!(jobs::job, jobs::patch, gc::delete_job))
         .routes(routes!(jobs::cancel))
         .routes(routes!(jobs::pause))
         .routes(routes!(jobs::resume))
         .routes(routes!(jobs::retry))
         .routes(routes!(jobs::skip))
         .routes(routes!(jobs::resubmit))
+        .routes(routes!(gc::preview))
         .routes(routes!(jobs::segments))
         .routes(routes!(jobs::batches))
         .routes(routes!(jobs::failures))
@@ -103,6 +106,7 @@ fn operations() -> OpenApiRouter<Arc<Api>> {
         .routes(routes!(admin::projects))
         .routes(routes!(admin::put_project))
         .routes(routes!(admin::audit))
+        .routes(routes!(gc::collect))
         // Health
         .routes(routes!(health::healthz))
         .routes(routes!(health::readyz))
@@ -173,6 +177,7 @@ pub fn router(coordinator: Arc<Coordinator>) -> Router {
         .route_layer(middleware::from_fn_with_state(api.clone(), guard))
         .merge(crate::dashboard::router())
         .layer(DefaultBodyLimit::max(limits::REQUEST_BYTES_MAX))
+        .layer(middleware::from_fn(trace::name))
         .fallback(unknown)
         .with_state(api)
 }
@@ -190,6 +195,7 @@ pub async fn serve(
     let loops = tokio::spawn(coordinator.clone().run());
     let events = tokio::spawn(coordinator.clone().pass_events_on());
     let pace = tokio::spawn(coordinator.clone().note_pace());
+    let garbage = tokio::spawn(coordinator.clone().collect_garbage());
     let (ended, late) = tokio::sync::oneshot::channel::<()>();
     let stopping = coordinator.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(async move {
@@ -207,7 +213,7 @@ pub async fn serve(
         () = too_late => tracing::warn!("requests were still under way {GRACE:?} after the end was asked for"),
     }
     coordinator.stop();
-    let _ = tokio::join!(loops, events, pace);
+    let _ = tokio::join!(loops, events, pace, garbage);
     coordinator.store.driver().close().await;
     Ok(())
 }

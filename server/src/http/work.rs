@@ -70,7 +70,11 @@ pub async fn claim(
     Json(request): Json<ClaimRequest>,
 ) -> Result<Response> {
     Ok(match api.coordinator.claim(&request, caller.token_id()).await? {
-        Some(claim) => Json(claim).into_response(),
+        Some(claim) => {
+            let Claim { lease, pass, segment, batches, task, .. } = &claim;
+            tracing::debug!(job = task.job, pass, segment, lease, ?batches, "granted");
+            Json(claim).into_response()
+        }
         None => StatusCode::NO_CONTENT.into_response(),
     })
 }

@@ -51,7 +51,8 @@ pub fn priority(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
 /// Two projects with shares of 3 to 1; the greater one's batches are four times as long.
 pub fn fairness(stage: &mut Stage, size: &Size) -> Result<Vec<Figure>> {
     for (name, share) in [("features", 300), ("shorts", 100)] {
-        let project = Project { name: name.into(), share, running_max: None };
+        let project =
+            Project { name: name.into(), share, running_max: None, retention_days: None, outputs_days: None };
         stage.client().put_project(&project)?;
     }
     let of = |name: &str| {

@@ -3,8 +3,10 @@
 mod access;
 mod bench;
 mod claims;
+mod garbage;
 mod graph;
 mod model;
+mod opinions;
 mod people;
 
 use std::sync::Arc;
@@ -65,7 +67,7 @@ fn run_on<F: Future<Output = ()>>(url: &str, test: impl FnOnce(Queue) -> F) {
         let store = Store::open(url, 16).await.expect("the database opens");
         store.migrate().await.expect("the schema is made");
         store.migrate().await.expect("and is there");
-        let queue = Queue { store: store.clone(), now: START };
+        let queue = Queue { store: store.clone(), now: START, opinion_every: 0 };
         test(queue).await;
         assert_eq!(store.drift().await.unwrap(), [], "counts differ from what they count");
         assert_eq!(store.orphans().await.unwrap(), 0, "leases and batches disagree");
@@ -78,6 +80,8 @@ fn run_on<F: Future<Output = ()>>(url: &str, test: impl FnOnce(Queue) -> F) {
 pub(crate) struct Queue {
     pub store: Store,
     pub now: i64,
+    /// One result in so many is to be confirmed.
+    pub opinion_every: u32,
 }
 
 /// A pass with what a test needs to claim from it.
@@ -164,8 +168,14 @@ impl Queue {
         granted: &Granted,
         items: &[CompleteItem],
     ) -> Completion {
-        let reporter =
-            Reporter { lease: &granted.lease, pass, session: worker, worker, around: self.around(9) };
+        let reporter = Reporter {
+            lease: &granted.lease,
+            pass,
+            session: worker,
+            worker,
+            around: self.around(9),
+            opinion_every: self.opinion_every,
+        };
         self.store.complete(&reporter, items).await.expect("completed")
     }
 

@@ -93,6 +93,7 @@ fn a_farm_bakes_what_one_process_bakes() {
         let kinds: Vec<&str> = all.iter().map(|(_, kind)| kind.as_str()).collect();
         assert_eq!(kinds, ["job.submitted", "job.running", "job.succeeded"]);
         assert_eq!(events(service, &jobs[0], all[1].0), all[2..]);
+        super::life::deployed_queries_are_answered(&people);
         service.runtime.block_on(async {
             assert_eq!(service.coordinator.store.drift().await.unwrap(), []);
             assert_eq!(service.coordinator.store.orphans().await.unwrap(), 0);
@@ -115,7 +116,7 @@ fn see(people: &Client, job: &str, output: &protocol::job::Output, path: &Path) 
     }
 }
 
-fn wait_for(client: &Client, jobs: &[String]) {
+pub fn wait_for(client: &Client, jobs: &[String]) {
     // A minute and a half is many times what it takes
     for _ in 0..450 {
         let is_over = |job: &String| client.job(job).unwrap().summary.state.is_final();

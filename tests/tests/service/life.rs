@@ -67,3 +67,23 @@ fn figures_are_told_and_documented() {
         assert!(handbook.contains(&format!("`{name}")), "{name} is not in docs/operations.md");
     }
 }
+
+/// Catches a panel or an alert that asks for a figure that nobody tells; after work was done, so that all are told.
+pub fn deployed_queries_are_answered(client: &worker::client::Client) {
+    let asked = [
+        include_str!("../../../deploy/grafana/pantaray.json"),
+        include_str!("../../../deploy/prometheus/alerts.yml"),
+        include_str!("../../../deploy/kubernetes/worker.yaml"),
+    ];
+    let told = client.text("/metrics").unwrap();
+    let mut names = std::collections::BTreeSet::new();
+    for text in asked {
+        let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+        names.extend(words.filter(|word| word.starts_with("pantaray_")));
+    }
+    assert!(names.len() > 12, "{names:?}");
+    for name in names {
+        let is_told = |line: &str| line.strip_prefix(name).is_some_and(|rest| rest.starts_with(['{', ' ']));
+        assert!(told.lines().any(is_told), "`{name}` is asked for in deploy/, and not told");
+    }
+}

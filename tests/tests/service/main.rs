@@ -2,6 +2,7 @@
 
 mod bakes;
 mod browser;
+mod garbage;
 mod leases;
 mod life;
 mod people;

@@ -140,6 +140,14 @@ impl Client {
         self.ask("PUT", path, Some(encode(body)?), &[], Duration::ZERO)
     }
 
+    /// DELETEs `path`.
+    ///
+    /// # Errors
+    /// As [`get`](Self::get).
+    pub fn delete<R: DeserializeOwned>(&self, path: &str) -> Result<R> {
+        self.ask("DELETE", path, None, &[], Duration::ZERO)
+    }
+
     /// A request whose answer is JSON, or empty, which reads as `null`.
     fn ask<R: DeserializeOwned>(
         &self,
@@ -299,6 +307,8 @@ impl Client {
         if reply.status().is_success() {
             return Ok(reply);
         }
+        let id = reply.headers().get("x-request-id").and_then(|value| value.to_str().ok());
+        tracing::debug!(request_id = id, status, "refused");
         let seconds = reply.headers().get("retry-after").and_then(|value| value.to_str().ok()?.parse().ok());
         let bytes = reply.body_mut().with_config().limit(1 << 16).read_to_vec().unwrap_or_default();
         let problem = serde_json::from_slice(&bytes).unwrap_or_else(|_| {

@@ -143,6 +143,7 @@ impl Executor {
         let &[batch] = &work.claim.batches[..] else {
             return Err(engine::Error::invalid(format!("a pass of kind `{kind}` has one batch")).into());
         };
+        let _span = tracing::error_span!("batch", batch = batch.batch, fence = batch.fence).entered();
         let folder = keys::result_folder(&work.claim.task.job, work.claim.pass, batch.fence);
         let finished = match kind {
             PassKind::Import => self.import(work, &folder)?,

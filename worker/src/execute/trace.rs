@@ -43,6 +43,7 @@ impl Executor {
         let (mut part, mut bytes) = (Part::default(), Vec::new());
         let claimed = &work.claim.batches;
         for (number, &batch) in claimed.iter().enumerate() {
+            let span = tracing::error_span!("batch", batch = batch.batch, fence = batch.fence).entered();
             sink.begins(claimed.len() - number);
             let start = Instant::now();
             bytes.clear();
@@ -57,6 +58,8 @@ impl Executor {
             }
             let rate = totals.rays as f64 / totals.seconds.max(1e-9) / 1e6;
             let log = format!("traced {} rays in {:.3} s, {rate:.1} M rays/s\n", totals.rays, totals.seconds);
+            tracing::debug!("{}", log.trim_end());
+            drop(span);
             work.control.progress.update("trace", (number + 1) as f64 / claimed.len() as f64, "");
             if !sink.part(batch, &bytes, start.elapsed(), &log)? {
                 break;
