@@ -14,6 +14,7 @@ pub mod overview;
 pub mod problem;
 pub mod states;
 pub mod storage;
+pub mod traced;
 pub mod work;
 
 pub use problem::Problem;

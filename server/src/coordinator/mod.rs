@@ -6,6 +6,7 @@
 pub mod bytes;
 mod estimate;
 pub mod pace;
+mod provisional;
 mod publish;
 pub mod submit;
 mod tick;
@@ -18,6 +19,7 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use protocol::events::Event;
+use protocol::overview::JobProgress;
 use protocol::work::Task;
 use tokio::sync::{Notify, broadcast};
 
@@ -61,8 +63,12 @@ pub struct Coordinator {
     assets: Mutex<HashMap<String, Arc<HashSet<String>>>>,
     /// How fast jobs go.
     pub pace: pace::Pace,
+    /// What there is to see of bakes that are under way.
+    provisionals: provisional::Provisionals,
     /// What happens, for listeners.
     pub events: broadcast::Sender<Event>,
+    /// How far jobs are, likewise.
+    pub progress: broadcast::Sender<JobProgress>,
     last_event: AtomicI64,
     stopping: AtomicBool,
     /// Wakes what waits for the end.
@@ -102,7 +108,9 @@ impl Coordinator {
             tasks: Mutex::default(),
             assets: Mutex::default(),
             pace: pace::Pace::default(),
+            provisionals: provisional::Provisionals::default(),
             events: broadcast::channel(EVENTS_MAX).0,
+            progress: broadcast::channel(EVENTS_MAX).0,
             last_event,
             stopping: AtomicBool::new(false),
             stopped: Notify::new(),

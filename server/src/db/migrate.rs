@@ -5,7 +5,7 @@ use crate::error::Kind;
 use crate::{Error, Result, values};
 
 /// For each version, from 1: SQLite's script and PostgreSQL's.
-const MIGRATIONS: [(&str, &str); 2] = [
+const MIGRATIONS: [(&str, &str); 3] = [
     (
         include_str!("../../../migrations/sqlite/0001_queue.sql"),
         include_str!("../../../migrations/postgres/0001_queue.sql"),
@@ -13,6 +13,10 @@ const MIGRATIONS: [(&str, &str); 2] = [
     (
         include_str!("../../../migrations/sqlite/0002_session.sql"),
         include_str!("../../../migrations/postgres/0002_session.sql"),
+    ),
+    (
+        include_str!("../../../migrations/sqlite/0003_traced.sql"),
+        include_str!("../../../migrations/postgres/0003_traced.sql"),
     ),
 ];
 

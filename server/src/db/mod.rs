@@ -19,6 +19,7 @@ pub mod list;
 mod migrate;
 pub mod postgres;
 pub mod sqlite;
+pub mod traced;
 pub mod truth;
 pub mod view;
 pub mod worker;

@@ -42,7 +42,7 @@ pub(super) fn summary(row: &Row) -> Result<JobSummary> {
     })
 }
 
-fn counts(row: &Row, first: usize) -> Result<Counts> {
+pub(super) fn counts(row: &Row, first: usize) -> Result<Counts> {
     Ok(Counts {
         ready: row.int(first)?,
         leased: row.int(first + 1)?,
@@ -86,9 +86,12 @@ impl Store {
                 CAST(COALESCE(SUM(s.ewma_ms * s.n_done) / NULLIF(SUM(CASE WHEN s.ewma_ms > 0 THEN s.n_done ELSE 0 END), 0), 0) AS BIGINT)
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
             GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result ORDER BY p.id";
-        let pass = |row: &Row| {
+        let mut traced = self.traced_of(job).await?;
+        let mut pass = |row: &Row| {
+            let id = row.int(0)?;
             Ok(PassDetail {
-                id: row.int(0)?,
+                id,
+                traced: traced.remove(&id),
                 kind: row.word(1, PassKind::from_code)?,
                 name: row.text(2)?,
                 state: row.word(3, PassState::from_code)?,
@@ -100,7 +103,7 @@ impl Store {
                 batch_ms: row.int(13)?,
             })
         };
-        self.query(sql, values![job]).await?.iter().map(pass).collect()
+        self.query(sql, values![job]).await?.iter().map(&mut pass).collect()
     }
 
     /// Mean milliseconds of a batch of the latest bakes; none where there was no bake.
@@ -213,7 +216,10 @@ impl Store {
                 (SELECT COUNT(*) FROM batch_fault f WHERE f.worker = w.name AND f.class IN (3, 7) AND f.at > $1)
             FROM worker w ORDER BY w.name LIMIT 10000";
         let rows = self.query(sql, values![now - crate::scheduler::failure::SICK_MS]).await?;
-        let worker = |row: &Row| {
+        let mut latest = self.latest_traced().await?;
+        let mut worker = |row: &Row| {
+            let name = row.text(0)?;
+            let (device, traced) = latest.remove(&name).map(|work| (work.device, work.traced)).unzip();
             let (leased, last_seen) = (row.int(8)?, row.int(7)?);
             let state = match () {
                 () if now - last_seen >= WORKER_LOST_MS => "lost",
@@ -224,7 +230,9 @@ impl Store {
                 () => "idle",
             };
             Ok(WorkerDetail {
-                name: row.text(0)?,
+                name,
+                device: device.unwrap_or_default(),
+                traced,
                 state: state.into(),
                 labels: serde_json::from_str(&row.text(1)?)?,
                 memory_bytes: row.int(2)?,
@@ -234,6 +242,6 @@ impl Store {
                 last_seen,
             })
         };
-        rows.iter().map(worker).collect()
+        rows.iter().map(&mut worker).collect()
     }
 }

@@ -162,8 +162,14 @@ impl Queue {
         granted: &Granted,
         items: &[CompleteItem],
     ) -> Completion {
-        let reporter =
-            Reporter { lease: &granted.lease, pass, session: worker, worker, around: self.around(9) };
+        let reporter = Reporter {
+            lease: &granted.lease,
+            pass,
+            session: worker,
+            worker,
+            device: "cpu",
+            around: self.around(9),
+        };
         self.store.complete(&reporter, items).await.expect("completed")
     }
 
@@ -221,7 +227,7 @@ pub(crate) fn built() -> PassResult {
 pub(crate) fn done(granted: &Granted, i: usize, sha256: &str) -> CompleteItem {
     let outcome = Outcome::Done { sha256: sha256.repeat(32), bytes: 10, result: None };
     let batch = granted.batches[i];
-    CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms: 100, outcome }
+    CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms: 100, traced: None, outcome }
 }
 
 pub(crate) fn all_done(granted: &Granted) -> Vec<CompleteItem> {
