@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use engine::bake::{BakeOptions, Control, Quiet};
 use engine::scene::Roots;
@@ -12,7 +11,7 @@ use protocol::storage::{FolderFile, SceneFiles};
 use protocol::work::{Claim, ClaimedBatch, PartEntry, PartPage, PassResult, Task};
 use protocol::{FailureClass, PassKind, keys};
 
-use super::{Executor, PartSink, Work};
+use super::{Baked, Executor, PartSink, Work};
 use crate::cache::Cache;
 use crate::depot::{Depot, Wanted};
 use crate::{Error, Result, digest};
