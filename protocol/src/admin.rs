@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use crate::states::Role;
+use crate::traced::Traced;
 
 /// A worker as lists have it.
 #[derive(Clone, Debug, Serialize, Deserialize, ToSchema)]
@@ -25,6 +26,12 @@ pub struct WorkerDetail {
     /// Why the coordinator has locked it, where it has.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub reason: String,
+    /// What traced the batches that it reported last: `cpu`, or the names of adapters; empty where it has traced none.
+    #[serde(default)]
+    pub device: String,
+    /// What tracing its batches of that pass took.
+    #[serde(default)]
+    pub traced: Option<Traced>,
     /// Milliseconds since 1970 when it was last heard of.
     pub last_seen: i64,
 }

@@ -7,6 +7,7 @@ use utoipa::ToSchema;
 
 use crate::overview::JobNow;
 use crate::states::{BatchState, FailureClass, JobState, PassKind, PassState, WaitReason};
+use crate::traced::Traced;
 use crate::work::PassResult;
 
 /// How to bake, as `pantaray bake` has it; words that only the engine understands are checked when a job is submitted.
@@ -266,6 +267,9 @@ pub struct PassDetail {
     /// What it found out, such as how many batches and points there are, and of how many bytes its result is.
     #[serde(default)]
     pub result: Option<PassResult>,
+    /// What tracing its batches took, where any was traced.
+    #[serde(default)]
+    pub traced: Option<Traced>,
 }
 
 /// A segment of a pass.

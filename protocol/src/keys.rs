@@ -47,6 +47,11 @@ pub fn log(job: &str, pass: i64, batch: i64, fence: i64) -> String {
     format!("jobs/{job}/logs/p{pass}/b{batch:08}-f{fence}.log")
 }
 
+/// The preview of a bake pass that is under way, as it was at a moment.
+pub fn provisional(job: &str, pass: i64, made_at: i64) -> String {
+    format!("jobs/{job}/provisional/p{pass}-{made_at}.preview")
+}
+
 /// What a job published.
 pub fn manifest(job: &str) -> String {
     format!("jobs/{job}/manifest.json")

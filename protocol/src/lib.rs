@@ -15,6 +15,7 @@ pub mod overview;
 pub mod problem;
 pub mod states;
 pub mod storage;
+pub mod traced;
 pub mod work;
 
 pub use problem::Problem;

@@ -1,5 +1,9 @@
 //! Bounds that both sides keep: what they protect is said with each.
 
+/// What one batch may add to any sum of what tracing took.
+pub const TRACED_MAX: i64 = 1 << 42;
+/// Bytes of a device's name.
+pub const DEVICE_BYTES_MAX: usize = 200;
 /// Bytes of a JSON request.
 pub const REQUEST_BYTES_MAX: usize = 16 << 20;
 /// Bytes of one uploaded asset.

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::job::Counts;
 use crate::states::{PassKind, WaitReason};
 
 /// What a live job does at this moment.
@@ -16,6 +17,19 @@ pub struct JobNow {
     pub per_minute: Option<f64>,
     /// Milliseconds until they have all ended, at that pace.
     pub left_ms: Option<i64>,
+}
+
+/// How far a live job is: what listeners of events hear twice a second at most, as an event `progress` without a number.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct JobProgress {
+    /// The job.
+    pub job: String,
+    /// Its project.
+    pub project: String,
+    /// Batches of its bake passes.
+    pub batches: Counts,
+    /// What it does.
+    pub now: JobNow,
 }
 
 /// The farm at a glance.
@@ -79,6 +93,23 @@ pub struct LeaseDetail {
     pub expires_at: i64,
     /// Mean milliseconds of a batch of this segment, or else of the pass; 0 where none has ended.
     pub batch_ms: i64,
+}
+
+/// What there is to see of a bake pass that is under way.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Provisional {
+    /// The file's name that the result will have: the bake set and `.mgs`.
+    pub name: String,
+    /// The pass.
+    pub pass: i64,
+    /// Batches done.
+    pub done: i64,
+    /// Batches of the pass.
+    pub batches: i64,
+    /// Points in the preview, at most those of the batches that are done.
+    pub points: u64,
+    /// Milliseconds since 1970 when the preview was made; it names the preview.
+    pub made_at: i64,
 }
 
 /// How many batches of a job's bake passes were done at a moment.

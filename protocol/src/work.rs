@@ -5,6 +5,7 @@ use utoipa::ToSchema;
 
 use crate::job::BakeSettings;
 use crate::states::{FailureClass, PassKind};
+use crate::traced::Traced;
 
 /// The version of this protocol; a coordinator accepts workers of its own and of the version before.
 pub const PROTOCOL_VERSION: u32 = 1;
@@ -160,6 +161,9 @@ pub struct CompleteRequest {
     pub session: String,
     /// The pass.
     pub pass: i64,
+    /// What traced: `cpu`, or the names of adapters; empty where nothing was traced.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub device: String,
     /// One for each batch, up to 64.
     pub items: Vec<CompleteItem>,
 }
@@ -174,6 +178,9 @@ pub struct CompleteItem {
     /// Milliseconds of work.
     #[serde(default)]
     pub elapsed_ms: i64,
+    /// What tracing took, where it was traced.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub traced: Option<Traced>,
     /// What became of it.
     #[serde(flatten)]
     pub outcome: Outcome,

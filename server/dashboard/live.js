@@ -14,7 +14,7 @@ let heard = 0;
 let connected = false;
 let controller = null;
 
-/** Calls back for each event until the answer is called. */
+/** Calls back for each event until the answer is called; `progress` says how far a live job is, twice a second at most. */
 export function onEvent(listener) {
   listeners.add(listener);
   return () => listeners.delete(listener);
@@ -55,7 +55,7 @@ function take(message) {
 
 async function listen(signal) {
   const headers = last === null ? {} : { "Last-Event-ID": last };
-  const answer = await getRaw("/v1/events", { headers, signal });
+  const answer = await getRaw("/v1/events?progress=true", { headers, signal });
   heard = Date.now();
   become(true);
   const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();

@@ -6,6 +6,10 @@ import { tellProblem } from "/dashboard/dialog.js";
 const PAGE = 100;
 const PAGES_MAX = 40;
 const AROUND = 6;
+/** Milliseconds of drawing in one frame: what is left comes in the next. */
+const BITE_MS = 8;
+/** Rows are drawn anew this often though nothing of them has changed: they hold ages. */
+const AGE_MS = 15_000;
 
 /**
  * `columns`: `{key, name, render(row), sort, className, wide}`; `fetch(offset, limit)` answers `{rows, total}`;
@@ -21,13 +25,14 @@ export class Table {
     this.selection = new Set();
     this.cursor = 0;
     this.live = new Map();
+    this.frame = 0;
     this.head = h("div", { class: "t-head", role: "row" });
     this.body = h("div", { class: "t-body", role: "rowgroup" });
     this.scroll = h("div", { class: "t-scroll", role: "grid", "aria-label": label, "aria-multiselectable": onSelect ? "true" : null, tabindex: "0", onscroll: () => this.draw(), onkeydown: (event) => this.key(event) },
       this.head, this.body);
     this.none = h("div", { class: "t-none", hidden: true });
     this.element = h("div", { class: "table" }, this.scroll, this.none);
-    this.resize = new ResizeObserver(() => { this.live.forEach((row) => row.element.remove()); this.live.clear(); this.draw(); });
+    this.resize = new ResizeObserver(() => { this.measure(); this.draw(); });
     this.resize.observe(this.scroll);
     this.drawHead();
   }
@@ -35,10 +40,11 @@ export class Table {
   /** Ends what the table watches. */
   end() {
     this.resize.disconnect();
+    cancelAnimationFrame(this.frame);
   }
 
-  get rowHeight() {
-    return parseFloat(getComputedStyle(this.element).getPropertyValue("--row")) || 36;
+  measure() {
+    this.rowHeight = parseFloat(getComputedStyle(this.element).getPropertyValue("--row")) || 36;
   }
 
   drawHead(sort, order) {
@@ -104,7 +110,26 @@ export class Table {
     return [first, last];
   }
 
+  /** Draws soon: once a frame, however often it is asked for. */
   draw() {
+    this.frame ||= requestAnimationFrame(() => {
+      this.frame = 0;
+      this.paint();
+    });
+  }
+
+  /** Changes a row that is in view. */
+  patch(id, change) {
+    const there = this.live.get(id);
+    const rows = there && this.pages.get(Math.floor(there.index / PAGE));
+    const at = there ? there.index % PAGE : -1;
+    if (!rows?.[at] || this.id(rows[at]) !== id) return;
+    rows[at] = change(rows[at]);
+    this.draw();
+  }
+
+  paint() {
+    const start = performance.now();
     const height = this.rowHeight;
     this.body.style.height = `${this.total * height}px`;
     this.scroll.setAttribute("aria-rowcount", this.total);
@@ -120,7 +145,8 @@ export class Table {
       }
       const id = this.id(row);
       drawn.add(id);
-      this.drawRow(id, row, index, height);
+      if (performance.now() - start < BITE_MS) this.drawRow(id, row, index, height);
+      else this.draw();
     }
     for (const [id, { element }] of this.live) {
       if (drawn.has(id)) continue;
@@ -135,14 +161,19 @@ export class Table {
     let there = this.live.get(id);
     if (!there) {
       const element = h("div", { class: "t-row", role: "row", onclick: (event) => this.click(event, id), ondblclick: () => this.open?.(this.live.get(id).row) });
-      there = { element, row: null };
+      there = { element, text: "" };
       this.live.set(id, there);
       this.body.append(element);
     }
-    if (there.row !== row) {
-      there.row = row;
+    there.row = row;
+    const text = `${JSON.stringify(row)} ${Math.floor(Date.now() / AGE_MS)}`;
+    if (there.text !== text) {
+      there.text = text;
+      // Whoever has the keyboard on a button of the row keeps it there
+      const held = [...there.element.querySelectorAll("a, button, input")].indexOf(document.activeElement);
       const check = this.onSelect && h("span", { class: "t-cell t-check", role: "gridcell" }, h("input", { type: "checkbox", tabindex: "-1", "aria-label": "Select this row", onchange: (event) => this.select(id, event.target.checked) }));
       put(there.element, check, this.columns.map((column) => append(h("span", { class: `t-cell ${column.className ?? ""}`, role: "gridcell", "data-name": column.name }), [column.render(row)])));
+      if (held >= 0) there.element.querySelectorAll("a, button, input")[held]?.focus({ preventScroll: true });
     }
     const { element } = there;
     element.style.transform = `translateY(${index * height}px)`;

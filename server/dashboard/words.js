@@ -14,7 +14,7 @@ const STATES = {
   failing: ["!", "Failing", "failed"],
   creating: ["⋯", "Being created", "quiet"],
   waiting: ["⋯", "Waiting", "quiet"],
-  open: ["▶", "Open", "running"],
+  open: ["▶", "Running", "running"],
   done: ["✓", "Done", "done"],
   leased: ["▶", "Running", "running"],
   skipped: ["⊘", "Skipped", "quiet"],

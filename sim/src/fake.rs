@@ -211,6 +211,7 @@ impl Fake {
                 batch: batch.batch,
                 fence: batch.fence,
                 elapsed_ms: (load.told_ms as f64 * self.temper.slowness) as i64,
+                traced: None,
                 outcome: self.outcome(&load, claim.pass, batch.batch),
             });
             self.report(session, claim, items.collect());
@@ -259,7 +260,8 @@ impl Fake {
         }
         let outcome =
             Outcome::Done { sha256: content.sha256, bytes: content.bytes as i64, result: Some(result) };
-        let item = CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms: 10, outcome };
+        let item =
+            CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms: 10, traced: None, outcome };
         self.report(session, claim, vec![item]);
     }
 
@@ -289,7 +291,8 @@ impl Fake {
             session.held = Some((claim.clone(), items));
             return;
         }
-        let request = CompleteRequest { session: session.id.clone(), pass: claim.pass, items };
+        let request =
+            CompleteRequest { session: session.id.clone(), pass: claim.pass, device: String::new(), items };
         if self.random.happens(wire.lost) {
             std::thread::sleep(Duration::from_millis(30));
         }
@@ -328,7 +331,12 @@ impl Fake {
     /// Sends a report that was late.
     fn send_held(&mut self, session: &mut Session) {
         if let Some((claim, items)) = session.held.take() {
-            let request = CompleteRequest { session: session.id.clone(), pass: claim.pass, items };
+            let request = CompleteRequest {
+                session: session.id.clone(),
+                pass: claim.pass,
+                device: String::new(),
+                items,
+            };
             self.send(session, &claim, &request);
         }
     }

@@ -16,6 +16,9 @@ export const complaints = [];
 /** A page of its own session, 1280 by 800 unless said otherwise. */
 export async function open(browser, { width = 1280, height = 800, light = false } = {}) {
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: light ? "light" : "dark" });
+  // Who works on the dashboard has its files from the folder, and builds nothing for a change
+  const folder = process.env.PANTARAY_DASHBOARD;
+  if (folder) await context.route(/\/dashboard\//, (route) => route.fulfill({ path: `${folder}${new URL(route.request().url()).pathname.slice("/dashboard".length)}` }));
   const page = await context.newPage();
   page.setDefaultTimeout(30_000);
   page.on("pageerror", (error) => complaints.push(`an error in the page: ${error.message}`));
@@ -40,6 +43,39 @@ export async function signIn(page, token) {
 /** Keeps a picture of the page as an artefact. */
 export async function keep(page, name, whole = false) {
   await page.screenshot({ path: `${pictures}/${name}.png`, fullPage: whole });
+}
+
+/** Milliseconds of the page's thread that no task may take. */
+const TASK_MS_MAX = 50;
+
+/**
+ * Does something in a page, and stops the test where a task of its thread takes longer than people bear. Its own time is
+ * measured, not the clock's, in which the rest of the machine has its share.
+ */
+export async function fluid(page, what, action) {
+  const session = await page.context().newCDPSession(page);
+  await session.send("Tracing.start", { categories: "devtools.timeline,disabled-by-default-devtools.timeline", transferMode: "ReturnAsStream" });
+  const result = await action();
+  const complete = new Promise((done) => session.once("Tracing.tracingComplete", done));
+  await session.send("Tracing.end");
+  const { stream } = await complete;
+  let text = "";
+  for (let end = false; !end; ) {
+    const piece = await session.send("IO.read", { handle: stream });
+    text += piece.data;
+    end = piece.eof;
+  }
+  await session.detach();
+  const events = JSON.parse(text).traceEvents;
+  const threads = new Set(events.filter((event) => event.name === "thread_name" && event.args.name === "CrRendererMain").map((event) => `${event.pid}/${event.tid}`));
+  const tasks = events.filter((event) => event.name === "RunTask" && threads.has(`${event.pid}/${event.tid}`));
+  check(tasks.length > 0, "tasks are traced");
+  const [longest] = tasks.sort((a, b) => (b.tdur ?? 0) - (a.tdur ?? 0));
+  const within = events.filter((event) => event.pid === longest.pid && event.tid === longest.tid && event !== longest && event.ts >= longest.ts && event.ts + (event.dur ?? 0) <= longest.ts + longest.dur && event.tdur > 1_000);
+  const parts = within.sort((a, b) => b.tdur - a.tdur).slice(0, 4).map((event) => `${event.name} ${Math.round(event.tdur / 1_000)}`).join(", ");
+  console.log(`the longest task of ${what}: ${Math.round(longest.tdur / 1_000)} ms (${parts})`);
+  check(longest.tdur / 1_000 < TASK_MS_MAX, `no task of ${what} takes ${TASK_MS_MAX} ms`);
+  return result;
 }
 
 /** Stops the test where something is not so. */

@@ -11,19 +11,27 @@ use glam::{DVec3, Vec3};
 /// A stream of `count` points on a wavy sheet 100 units wide, a kilometre from the origin, of which every `hole`-th has no
 /// result. The first coefficient of a point is its x.
 fn stream(path: &Path, count: usize, hole: usize) -> MgsReader {
-    let attributes = vec![
+    stream_with(path, count, hole, false)
+}
+
+/// The same; with `error`, its coefficients have one, which is a hundredth of x.
+fn stream_with(path: &Path, count: usize, hole: usize, error: bool) -> MgsReader {
+    let mut attributes = vec![
         Attribute::vertex("N", ValueType::F32, 3),
         Attribute::vertex("albedo", ValueType::F32, 3),
         Attribute::vertex("sky", ValueType::F32, 9),
         Attribute::vertex("baked", ValueType::U8, 1),
     ];
+    if error {
+        attributes.push(Attribute::vertex("sky_error", ValueType::F32, 1));
+    }
     let schema = Schema { attributes, up: UpAxis::Z, ..Schema::default() };
     let noted = [("sky.shader", "sh_occlusion"), ("sky.weight", "cosine")];
     let metadata: Vec<_> = noted.map(|(key, value)| (key.to_string(), value.to_string())).into();
     let mut writer = MgsWriter::create(path, &schema, &metadata).unwrap();
     let mut grid = Microgrid::default();
     for first in (0..count).step_by(200) {
-        grid.clear(4);
+        grid.clear(schema.attributes.len());
         grid.anchor = DVec3::new(1_000.0, 0.0, 0.0);
         for at in first..(first + 200).min(count) {
             let (x, y) = (100.0 * (at as f32 * 0.618_034).fract(), 100.0 * at as f32 / count as f32);
@@ -33,6 +41,9 @@ fn stream(path: &Path, count: usize, hole: usize) -> MgsReader {
             grid.push_values(&schema.attributes[1], 1, &[1.0, 0.5, 0.0]);
             grid.push_values(&schema.attributes[2], 2, &[x, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.25]);
             grid.push_values(&schema.attributes[3], 3, &[if at % hole == 0 { 0.0 } else { 1.0 }]);
+            if error {
+                grid.push_values(&schema.attributes[4], 4, &[0.01 * x]);
+            }
         }
         writer.write(&grid).unwrap();
     }
@@ -110,6 +121,41 @@ fn every_point_is_where_it_was() {
     // 8,192 points of 32 bytes fill a node: the root's are a fair sample of all
     assert_eq!(preview.nodes[0].points, 8_192);
     assert!((preview.nodes[0].spacing - 1.1).abs() < 0.3, "{}", preview.nodes[0].spacing);
+}
+
+/// Catches an error that is not looked for, belongs to another point, or stands where a reader does not expect it; and files
+/// of the version before that are refused.
+#[test]
+fn points_have_the_error_of_their_coefficients() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut stream = stream_with(&folder.path().join("in.mgs"), 2_000, 3, true);
+    let target = folder.path().join("out.preview");
+    write_preview(&mut stream, &target, 1 << 30, &mut |_| {}).unwrap();
+    let mut preview = Preview::open(&target).unwrap();
+    assert_eq!((preview.header.has_error, preview.header.record_bytes()), (true, 36));
+    let mut bytes = Vec::new();
+    preview.read(0, &mut bytes).unwrap();
+    for record in bytes.chunks_exact(36) {
+        let (x, error) = (f16(&record[14..16]), f16(&record[32..34]));
+        assert!((error - 0.01 * x).abs() < 0.002 && record[34..] == [0, 0], "{x} {error}");
+    }
+
+    // Version 1 is the same without it
+    let mut stream = self::stream(&folder.path().join("old.mgs"), 2_000, 3);
+    write_preview(&mut stream, &target, 1 << 30, &mut |_| {}).unwrap();
+    let mut old = std::fs::read(&target).unwrap();
+    old[8] = 1;
+    let sum = u32::from_le_bytes(old[12..16].try_into().unwrap()) as usize - 4;
+    let crc = crc32(&old[..sum]);
+    old[sum..sum + 4].copy_from_slice(&crc.to_le_bytes());
+    std::fs::write(&target, old).unwrap();
+    assert!(!Preview::open(&target).unwrap().header.has_error);
+}
+
+/// CRC-32 (IEEE), bit by bit.
+fn crc32(bytes: &[u8]) -> u32 {
+    let bit = |sum: u32| if sum & 1 == 1 { sum >> 1 ^ 0xedb8_8320 } else { sum >> 1 };
+    !bytes.iter().fold(!0, |sum, &byte| (0..8).fold(sum ^ u32::from(byte), |sum, _| bit(sum)))
 }
 
 /// Catches a preview that outgrows its memory, and one that differs from run to run.

@@ -5,7 +5,9 @@ use std::time::Duration;
 use protocol::keys;
 use protocol::limits::{CLAIM_MAX, MESSAGE_BYTES_MAX, cut};
 use protocol::storage::FolderFile;
-use protocol::work::{CompleteItem, CompleteReply, CompleteRequest, LogRequest, Outcome, Verdict};
+use protocol::work::{
+    ClaimedBatch, CompleteItem, CompleteReply, CompleteRequest, LogRequest, Outcome, Verdict,
+};
 
 use crate::client::Client;
 use crate::depot::Depot;
@@ -24,7 +26,7 @@ pub fn deliver(client: &Client, pulse: &Pulse, spool: &Spool) {
         let Some(first) = parts.first() else { return };
         let (lease, pass) = (first.lease.clone(), first.pass);
         let items = parts.iter().map(|part| item(client, pulse, part)).collect();
-        let reply = report(client, pulse, &lease, pass, items);
+        let reply = report(client, pulse, &lease, (pass, &first.device), items);
         match &reply {
             Ok(reply) if reply.lease_live => {}
             Ok(reply) => {
@@ -71,7 +73,7 @@ fn item(client: &Client, pulse: &Pulse, part: &Spooled) -> CompleteItem {
         Err(error) => failed(error),
     };
     let elapsed_ms = i64::try_from(part.elapsed.as_millis()).unwrap_or(i64::MAX);
-    CompleteItem { batch, fence, elapsed_ms, outcome }
+    CompleteItem { batch, fence, elapsed_ms, traced: Some(part.traced), outcome }
 }
 
 /// A failure as an outcome.
@@ -81,7 +83,7 @@ pub fn failed(error: Error) -> Outcome {
     Outcome::Failed { class, message: cut(&message, MESSAGE_BYTES_MAX).into(), bad_parts }
 }
 
-/// Reports what became of batches.
+/// Reports what became of batches of `pass`, which `device` traced.
 ///
 /// # Errors
 /// When the coordinator refuses, or nobody wants the result any more.
@@ -89,10 +91,10 @@ pub fn report(
     client: &Client,
     pulse: &Pulse,
     lease: &Lease,
-    pass: i64,
+    (pass, device): (i64, &str),
     items: Vec<CompleteItem>,
 ) -> Result<CompleteReply> {
-    let request = CompleteRequest { session: pulse.session.clone(), pass, items };
+    let request = CompleteRequest { session: pulse.session.clone(), pass, device: device.into(), items };
     let client = client.with_patience(PATIENCE);
     insist(pulse, lease, || client.complete(&lease.id, &request))
 }

@@ -16,7 +16,7 @@ use crate::claims::{Claimed, Claims, release};
 use crate::client::{Client, jitter};
 use crate::deliver::{deliver, failed, report};
 use crate::depot::Depot;
-use crate::execute::{Executor, PartSink, Work};
+use crate::execute::{Baked, Executor, PartSink, Work};
 use crate::heartbeat::Pulse;
 use crate::remote::LeaseDepot;
 use crate::spool::Spool;
@@ -247,9 +247,9 @@ impl Desk<'_> {
     fn settle(&self, claimed: &Claimed, batch: ClaimedBatch, elapsed: Duration, outcome: Outcome) {
         self.spool.flush(&claimed.lease);
         let elapsed_ms = i64::try_from(elapsed.as_millis()).unwrap_or(i64::MAX);
-        let item = CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms, outcome };
+        let item = CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms, traced: None, outcome };
         let client = &self.options.client;
-        match report(client, self.pulse, &claimed.lease, claimed.claim.pass, vec![item]) {
+        match report(client, self.pulse, &claimed.lease, (claimed.claim.pass, ""), vec![item]) {
             Ok(reply) => tracing::info!(verdicts = ?reply.verdicts, "reported"),
             Err(error) => tracing::warn!("a result could not be reported: {error}"),
         }
@@ -275,9 +275,9 @@ struct ToSpool<'a> {
 }
 
 impl PartSink for ToSpool<'_> {
-    fn part(&mut self, batch: ClaimedBatch, bytes: &[u8], elapsed: Duration, log: &str) -> Result<bool> {
+    fn part(&mut self, batch: ClaimedBatch, baked: Baked<'_>) -> Result<bool> {
         let Claimed { claim, lease } = self.claimed;
-        self.spool.push(lease, (claim.pass, &claim.task.job), batch, bytes, (elapsed, log))?;
+        self.spool.push(lease, (claim.pass, &claim.task.job), batch, baked)?;
         self.given += 1;
         Ok(!self.stop.load(Ordering::Relaxed) && lease.is_live())
     }

@@ -6,9 +6,11 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use protocol::storage::FolderFile;
+use protocol::traced::Traced;
 use protocol::work::ClaimedBatch;
 
 use crate::cache::Scratch;
+use crate::execute::Baked;
 use crate::heartbeat::Lease;
 use crate::{Result, digest};
 
@@ -31,6 +33,10 @@ pub struct Spooled {
     pub elapsed: Duration,
     /// What there is to say about it.
     pub log: String,
+    /// What traced.
+    pub device: String,
+    /// What tracing took.
+    pub traced: Traced,
 }
 
 /// Finished parts, first in, first out.
@@ -67,9 +73,9 @@ impl Spool {
         lease: &Arc<Lease>,
         (pass, job): (i64, &str),
         batch: ClaimedBatch,
-        bytes: &[u8],
-        (elapsed, log): (Duration, &str),
+        baked: Baked<'_>,
     ) -> Result<()> {
+        let Baked { bytes, elapsed, traced, .. } = baked;
         let path = self.folder.path().join(format!("{pass}-{}-{}.part", batch.batch, batch.fence));
         std::fs::write(&path, bytes).map_err(|error| engine::Error::io("write", &path, error))?;
         let content = digest::of_bytes(bytes);
@@ -79,8 +85,10 @@ impl Spool {
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
         state.bytes += content.bytes;
-        let (lease, job, log) = (lease.clone(), job.to_owned(), log.to_owned());
-        state.waiting.push_back(Spooled { lease, pass, job, batch, path, content, elapsed, log });
+        let (lease, job) = (lease.clone(), job.to_owned());
+        let (log, device) = (baked.log.to_owned(), baked.device.to_owned());
+        let part = Spooled { lease, pass, job, batch, path, content, elapsed, log, device, traced };
+        state.waiting.push_back(part);
         self.changed.notify_all();
         Ok(())
     }

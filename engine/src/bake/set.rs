@@ -11,7 +11,7 @@ use super::map::occluders_of;
 use super::run::{Column, Run, Runs};
 use super::tracer::BatchTracer;
 use super::{BakeOptions, Control};
-use crate::batch::{BatchPlan, KeepAll, RAYS_PER_BATCH_MAX, SplitOptions, evenly_spaced, split};
+use crate::batch::{BatchPlan, KeepAll, RAYS_PER_BATCH_MAX, SplitOptions, split};
 use crate::brickmap::BrickMap;
 use crate::output::{MergeOptions, MergeReport, PartFormat, PartSource, merge};
 use crate::scene::{BakeSet, Scene, ShOcclusion, ShaderKind};
@@ -99,7 +99,7 @@ impl<'a> SetBake<'a> {
     /// The batches that the options ask for, in the order in which they are best baked.
     pub fn batches(&self, plan: &BatchPlan) -> Vec<u32> {
         let all = || (0..plan.len() as u32).collect();
-        self.options.points_max.map_or_else(all, |points| evenly_spaced(plan, points))
+        self.options.points_max.map_or_else(all, |points| plan.table().evenly_spaced(points))
     }
 
     /// What the parts of the set have in common.

@@ -8,6 +8,7 @@ use super::run::{Program, Runs};
 use super::work::BakeWork;
 use crate::Result;
 use crate::batch::{BatchPlan, Point};
+use crate::cut::arena::ArenaCounts;
 use crate::output::{Part, PartFormat};
 use crate::trace::{Backend, Shading};
 
@@ -99,6 +100,16 @@ impl BatchTracer {
             }
             part.set_row(&self.format, number, &self.row);
         }
+    }
+
+    /// What the arena has done since the tracer was made.
+    pub fn arena_counts(&self) -> ArenaCounts {
+        self.backend.arena_counts()
+    }
+
+    /// The name of what traces: `cpu`, or those of adapters.
+    pub fn device(&self) -> &str {
+        &self.backend.name
     }
 
     /// Adds to `work` what the arena has done since the tracer was made.

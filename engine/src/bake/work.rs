@@ -36,6 +36,16 @@ impl BakeWork {
         *(if counts.is_device { &mut self.device_batches } else { &mut self.cpu_batches }) += 1;
     }
 
+    /// Bytes that went to devices.
+    pub fn device_bytes(&self) -> u64 {
+        self.counts.device_bytes
+    }
+
+    /// Seconds that the busiest device was at work.
+    pub fn device_seconds(&self) -> f64 {
+        self.counts.device_seconds
+    }
+
     /// What went wrong with devices.
     pub fn troubles(&self) -> &[String] {
         &self.troubles

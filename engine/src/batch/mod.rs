@@ -15,7 +15,7 @@ mod split;
 pub use bitset::BitSet;
 pub use filter::{GridMask, KeepAll, PointFilter};
 pub use hilbert::HilbertCurve;
-pub use plan::{BatchInfo, BatchPlan, evenly_spaced};
+pub use plan::{BatchInfo, BatchPlan, PlanTable};
 pub(crate) use scratch::{ScratchFile, sweep};
 pub use split::{Progress, SplitOptions, split};
 

@@ -32,11 +32,17 @@ const POINTS_HEADER_BYTES: u64 = 16;
 /// Holds 64 bytes per batch in memory; points are read batch by batch.
 #[derive(Debug)]
 pub struct BatchPlan {
-    header: Header,
-    table: Vec<Record>,
-    hash: u64,
+    table: PlanTable,
     points_path: PathBuf,
     points_file: Mutex<File>,
+}
+
+/// The batches of a plan without their points: where those of each batch stand, for who reads single batches from afar.
+#[derive(Debug)]
+pub struct PlanTable {
+    header: Header,
+    records: Vec<Record>,
+    hash: u64,
 }
 
 /// What is known of a batch without reading its points.
@@ -78,40 +84,44 @@ impl BatchPlan {
     pub fn open(folder: impl AsRef<Path>) -> Result<Self> {
         let plan_path = folder.as_ref().join(PLAN_FILE);
         let points_path = folder.as_ref().join(POINTS_FILE);
-        let (header, table, hash) = read_table(&plan_path)?;
-        check_table(&plan_path, &header, &table)?;
-        let points_file = open_points(&points_path, header.points)?;
-        Ok(Self { header, table, hash, points_path, points_file: Mutex::new(points_file) })
+        let table = PlanTable::open(&plan_path)?;
+        let points_file = open_points(&points_path, table.header.points)?;
+        Ok(Self { table, points_path, points_file: Mutex::new(points_file) })
+    }
+
+    /// The plan without its points.
+    pub fn table(&self) -> &PlanTable {
+        &self.table
     }
 
     /// Batches.
     pub fn len(&self) -> usize {
-        self.table.len()
+        self.table.records.len()
     }
 
     /// Never: a plan has points.
     pub fn is_empty(&self) -> bool {
-        self.table.is_empty()
+        self.table.records.is_empty()
     }
 
     /// Points of all batches.
     pub fn points(&self) -> u64 {
-        self.header.points
+        self.table.header.points
     }
 
     /// Vertices of the stream; more than [`points`](Self::points) where a filter dropped some.
     pub fn stream_points(&self) -> u64 {
-        self.header.stream_points
+        self.table.header.stream_points
     }
 
     /// Points of a batch at most; all batches but one have as many.
     pub fn points_per_batch_max(&self) -> u32 {
-        self.header.points_per_batch_max
+        self.table.header.points_per_batch_max
     }
 
     /// A hash of the whole plan: equal for equal points in equal batches.
     pub fn hash(&self) -> u64 {
-        self.hash
+        self.table.hash
     }
 
     /// What is known of batch `i` without reading it.
@@ -119,7 +129,7 @@ impl BatchPlan {
     /// # Panics
     /// When `i` is not below [`len`](Self::len).
     pub fn batch(&self, i: usize) -> BatchInfo {
-        let record = &self.table[i];
+        let record = &self.table.records[i];
         BatchInfo { count: record.count, bounds: record.bounds }
     }
 
@@ -131,20 +141,69 @@ impl BatchPlan {
     /// # Panics
     /// When `i` is not below [`len`](Self::len).
     pub fn read(&self, i: usize, points: &mut Vec<Point>) -> Result<()> {
-        let record = &self.table[i];
-        let first = u64::from(record.leaf) * u64::from(self.header.points_per_batch_max);
-        let offset = POINTS_HEADER_BYTES + first * Point::BYTES as u64;
-        let mut bytes = vec![0; record.count as usize * Point::BYTES];
+        let range = self.table.points_range(i);
+        let mut bytes = vec![0; (range.end - range.start) as usize];
         {
             // The lock guards nothing but the file's position, which every reader sets anew.
             let mut file = self.points_file.lock().unwrap_or_else(PoisonError::into_inner);
-            let read = file.seek(SeekFrom::Start(offset)).and_then(|_| file.read_exact(&mut bytes));
+            let read = file.seek(SeekFrom::Start(range.start)).and_then(|_| file.read_exact(&mut bytes));
             read.map_err(|error| Error::io("read points", &self.points_path, error))?;
         }
-        if xxh3_64(&bytes) != record.hash {
-            return Err(
-                self.damaged(offset, format!("the points of batch `{i}` do not match their checksum"))
-            );
+        self.table.decode(i, &bytes, &self.points_path, points)
+    }
+}
+
+impl PlanTable {
+    /// Opens a plan's table, the file `plan.bin`.
+    ///
+    /// # Errors
+    /// As [`BatchPlan::open`].
+    pub fn open(path: &Path) -> Result<Self> {
+        let (header, records, hash) = read_table(path)?;
+        check_table(path, &header, &records)?;
+        Ok(Self { header, records, hash })
+    }
+
+    /// Batches.
+    pub fn len(&self) -> usize {
+        self.records.len()
+    }
+
+    /// Never: a plan has points.
+    pub fn is_empty(&self) -> bool {
+        self.records.is_empty()
+    }
+
+    /// Points of a batch at most.
+    pub fn points_per_batch_max(&self) -> u32 {
+        self.header.points_per_batch_max
+    }
+
+    /// Where in the points file, `points.bin`, the points of batch `i` stand.
+    ///
+    /// # Panics
+    /// When `i` is not below [`len`](Self::len).
+    pub fn points_range(&self, i: usize) -> std::ops::Range<u64> {
+        let record = &self.records[i];
+        let first = u64::from(record.leaf) * u64::from(self.header.points_per_batch_max);
+        let start = POINTS_HEADER_BYTES + first * Point::BYTES as u64;
+        start..start + u64::from(record.count) * Point::BYTES as u64
+    }
+
+    /// The points of batch `i`, which stand in `bytes`; `path` says where those came from.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Corrupt`] when the points are not those that were written.
+    ///
+    /// # Panics
+    /// When `i` is not below [`len`](Self::len).
+    pub fn decode(&self, i: usize, bytes: &[u8], path: &Path, points: &mut Vec<Point>) -> Result<()> {
+        let offset = self.points_range(i).start;
+        if bytes.len() != self.records[i].count as usize * Point::BYTES
+            || xxh3_64(bytes) != self.records[i].hash
+        {
+            let message = format!("the points of batch `{i}` do not match their checksum");
+            return Err(damaged(path, offset, message));
         }
         points.clear();
         points.extend(bytes.as_chunks().0.iter().map(Point::from_bytes));
@@ -152,28 +211,29 @@ impl BatchPlan {
             point.index < self.header.stream_points && point.position.is_finite() && point.normal.is_finite()
         };
         match points.iter().position(|point| !sound(point)) {
-            Some(at) => Err(self.damaged(
-                offset + (at * Point::BYTES) as u64,
-                format!("point {at} of batch `{i}` is not finite or has an index past the stream's end"),
-            )),
+            Some(at) => {
+                let message =
+                    format!("point {at} of batch `{i}` is not finite or has an index past the stream's end");
+                Err(damaged(path, offset + (at * Point::BYTES) as u64, message))
+            }
             None => Ok(()),
         }
     }
 
-    fn damaged(&self, offset: u64, message: String) -> Error {
-        Error::corrupt(&self.points_path, offset, message).hint("remove the folder to plan the batches again")
+    /// Whole batches, evenly spaced along the plan's order, of about `points_max` points and not more, but at least one.
+    pub fn evenly_spaced(&self, points_max: u64) -> Vec<u32> {
+        let batches = self.records.len() as u64;
+        if points_max >= self.header.points {
+            return (0..batches as u32).collect();
+        }
+        let chosen = (points_max / u64::from(self.header.points_per_batch_max)).clamp(1, batches);
+        // The middles of as many equal stretches
+        (0..chosen).map(|i| ((2 * i + 1) * batches / (2 * chosen)) as u32).collect()
     }
 }
 
-/// Whole batches, evenly spaced along the plan's order, of about `points_max` points and not more, but at least one.
-pub fn evenly_spaced(plan: &BatchPlan, points_max: u64) -> Vec<u32> {
-    let batches = plan.len() as u64;
-    if points_max >= plan.points() {
-        return (0..batches as u32).collect();
-    }
-    let chosen = (points_max / u64::from(plan.points_per_batch_max())).clamp(1, batches);
-    // The middles of as many equal stretches
-    (0..chosen).map(|i| ((2 * i + 1) * batches / (2 * chosen)) as u32).collect()
+fn damaged(path: &Path, offset: u64, message: String) -> Error {
+    Error::corrupt(path, offset, message).hint("remove the folder to plan the batches again")
 }
 
 /// Writes the points file and then the table: the writing half of a plan.

@@ -4,7 +4,7 @@ use std::fs;
 
 use proptest::prelude::*;
 
-use super::super::{GridMask, KeepAll, evenly_spaced};
+use super::super::{GridMask, KeepAll};
 use super::*;
 use crate::stream::{Attribute, Schema, ValueType};
 
@@ -268,11 +268,11 @@ fn chosen_batches_are_evenly_spaced() {
     let folder = tempfile::tempdir().expect("a folder");
     let plan = split(&mut grids(&cloud(1000), false), &mut KeepAll, &options(&folder, 10), &mut quiet)
         .expect("a plan");
-    assert_eq!(evenly_spaced(&plan, 1000).len(), 100);
-    assert_eq!(evenly_spaced(&plan, 0), [50]);
-    assert_eq!(evenly_spaced(&plan, 49), [12, 37, 62, 87]);
+    assert_eq!(plan.table().evenly_spaced(1000).len(), 100);
+    assert_eq!(plan.table().evenly_spaced(0), [50]);
+    assert_eq!(plan.table().evenly_spaced(49), [12, 37, 62, 87]);
     for points_max in (10..1000).step_by(7) {
-        let chosen = evenly_spaced(&plan, points_max);
+        let chosen = plan.table().evenly_spaced(points_max);
         assert_eq!(chosen.len() as u64, points_max / 10);
         let gaps = chosen.windows(2).map(|pair| pair[1] - pair[0]);
         let (least, most) = gaps.fold((u32::MAX, 0), |(least, most), gap| (least.min(gap), most.max(gap)));

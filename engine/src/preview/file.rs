@@ -19,8 +19,8 @@ use crate::{Error, ErrorKind, Result};
 
 /// The first bytes.
 const MAGIC: [u8; 8] = *b"PNTRPRVW";
-/// The layout's version.
-const VERSION: u32 = 1;
+/// The layout's version; version 1 is the same without errors.
+const VERSION: u32 = 2;
 /// Bytes of the header before the directory.
 const FIXED_BYTES: usize = 152;
 /// Bytes of the attribute's name, filled up with zeros.
@@ -55,15 +55,23 @@ pub struct Header {
     pub domain: Domain,
     /// Whether the stream has normals, and albedo.
     pub has: [bool; 2],
+    /// Whether points have the error of their coefficients.
+    pub has_error: bool,
     /// The attribute of the coefficients.
     pub attribute: String,
-    /// Its column in the stream; not written.
-    pub(super) column: usize,
+    /// Its column in the stream, and that of the error; not written.
+    pub(super) columns: (usize, Option<usize>),
 }
 
 impl Header {
     /// A header for a stream's coefficients; what the points say comes later.
-    pub(super) fn new(schema: &Schema, column: usize, weight: Weight, domain: Option<Domain>) -> Self {
+    pub(super) fn new(
+        schema: &Schema,
+        columns: (usize, Option<usize>),
+        weight: Weight,
+        domain: Option<Domain>,
+    ) -> Self {
+        let (column, error) = columns;
         let attribute = &schema.attributes[column];
         let normals = schema.find(names::NORMAL).is_some();
         Self {
@@ -77,8 +85,9 @@ impl Header {
             weight,
             domain: domain.unwrap_or(if normals { Domain::Hemisphere } else { Domain::Sphere }),
             has: [normals, schema.find(names::ALBEDO).is_some()],
+            has_error: error.is_some(),
             attribute: attribute.name.clone(),
-            column,
+            columns,
         }
     }
 
@@ -89,7 +98,7 @@ impl Header {
 
     /// Bytes of a point.
     pub fn record_bytes(&self) -> usize {
-        (RECORD_HEAD_BYTES + 2 * self.coefficients()).next_multiple_of(4)
+        (RECORD_HEAD_BYTES + 2 * (self.coefficients() + usize::from(self.has_error))).next_multiple_of(4)
     }
 
     fn encode(&self, nodes: usize) -> Vec<u8> {
@@ -109,7 +118,9 @@ impl Header {
         out.push(u8::from(self.domain == Domain::Sphere));
         out.extend_from_slice(&(self.record_bytes() as u32).to_le_bytes());
         out.extend_from_slice(&(nodes as u32).to_le_bytes());
-        out.extend([u8::from(self.has[0]) | u8::from(self.has[1]) << 1, 0, 0, 0]);
+        let flags = [self.has[0], self.has[1], self.has_error];
+        let flags = flags.into_iter().enumerate().map(|(bit, is)| u8::from(is) << bit).sum();
+        out.extend([flags, 0, 0, 0]);
         let mut name = [0; NAME_BYTES];
         let bytes = self.attribute.len().min(NAME_BYTES);
         name[..bytes].copy_from_slice(&self.attribute.as_bytes()[..bytes]);
@@ -135,8 +146,8 @@ pub struct Node {
     pub level: u8,
 }
 
-/// Writes a preview; its bytes.
-pub(super) fn write(target: &Path, header: &Header, nodes: &[Spread], points: &Points) -> Result<u64> {
+/// Header, directory and checksum, and how long all of the preview is.
+fn encode_start(header: &Header, nodes: &[Spread], points: &Points) -> (Vec<u8>, u64) {
     let record = header.record_bytes();
     let mut start = header.encode(nodes.len());
     let mut offset = (FIXED_BYTES + NODE_BYTES * nodes.len() + 4) as u64;
@@ -152,6 +163,25 @@ pub(super) fn write(target: &Path, header: &Header, nodes: &[Spread], points: &P
         offset += u64::from(node.points) * record as u64;
     }
     start.extend_from_slice(&crc32fast::hash(&start).to_le_bytes());
+    (start, offset)
+}
+
+/// A small preview, in memory.
+pub(super) fn encode(header: &Header, nodes: &[Spread], points: &Points) -> Vec<u8> {
+    let (mut all, length) = encode_start(header, nodes, points);
+    all.reserve_exact((length as usize).saturating_sub(all.len()));
+    let mut bytes = Vec::with_capacity(NODE_BYTES_MAX);
+    for spread in nodes {
+        encode_points(spread, header, points, &mut bytes);
+        all.extend_from_slice(&bytes);
+    }
+    all
+}
+
+/// Writes a preview; its bytes.
+pub(super) fn write(target: &Path, header: &Header, nodes: &[Spread], points: &Points) -> Result<u64> {
+    let (start, length) = encode_start(header, nodes, points);
+    let mut bytes = Vec::with_capacity(NODE_BYTES_MAX);
     let io = |error| Error::io("write", target, error);
     let mut file = BufWriter::new(AtomicFile::create(target)?);
     file.write_all(&start).map_err(io)?;
@@ -160,7 +190,7 @@ pub(super) fn write(target: &Path, header: &Header, nodes: &[Spread], points: &P
         file.write_all(&bytes).map_err(io)?;
     }
     file.into_inner().map_err(|error| io(error.into_error()))?.commit()?;
-    Ok(offset)
+    Ok(length)
 }
 
 /// The records of a node's points, their positions as 16 bits of its cube.
@@ -205,8 +235,8 @@ impl Preview {
             return Err(Error::new(ErrorKind::Corrupt, "not a preview").at(path));
         }
         let version = u32_at(&fixed, 8);
-        if version != VERSION {
-            let message = format!("a preview of version {version}, {VERSION} wanted");
+        if !(1..=VERSION).contains(&version) {
+            let message = format!("a preview of version {version}, 1 to {VERSION} wanted");
             return Err(Error::unsupported(message).at(path));
         }
         let (start, count) = (u64::from(u32_at(&fixed, 12)), u32_at(&fixed, 80));
@@ -273,8 +303,9 @@ fn decode_header(path: &Path, fixed: &[u8; FIXED_BYTES]) -> Result<Header> {
         weight: if fixed[74] == 1 { Weight::Cosine } else { Weight::Uniform },
         domain: if fixed[75] == 1 { Domain::Sphere } else { Domain::Hemisphere },
         has: [fixed[84] & 1 != 0, fixed[84] & 2 != 0],
+        has_error: fixed[84] & 4 != 0,
         attribute: String::from_utf8_lossy(name).into_owned(),
-        column: 0,
+        columns: (0, None),
     };
     if u32_at(fixed, 76) as usize != header.record_bytes()
         || !header.corner.is_finite()

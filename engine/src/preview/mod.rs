@@ -5,16 +5,19 @@
 //! adds detail to those above it; [`mod@file`] is the layout, with a reader that checks everything.
 
 pub mod file;
+mod parts;
 mod sample;
 mod tree;
 
 use std::path::Path;
 
 pub use file::{Header, Node, Preview, RECORD_HEAD_BYTES};
+pub use parts::{PartsPreview, Setting};
 
 use crate::relight::{find_attribute, noted, noted_attribute};
 use crate::stream::MicrogridStream;
 use crate::stream::file::MgsReader;
+use crate::stream::{Schema, ValueType};
 use crate::{Error, Result};
 
 /// Points of a preview at most.
@@ -52,8 +55,9 @@ pub fn write_preview(
     let column = find_attribute(&schema, noted_attribute(stream.metadata()))?;
     let name = schema.attributes[column].name.clone();
     let (weight, domain) = noted(stream.metadata(), &name);
+    let error = find_error(&schema, &name);
     let counts = stream.footer()?.counts;
-    let mut header = Header::new(&schema, column, weight, domain);
+    let mut header = Header::new(&schema, (column, error), weight, domain);
     let points_max = (memory_bytes / sample::bytes_per_point(&header)).min(POINTS_MAX);
     let wanted = sample::Wanted { vertices: counts.vertices, points_max, corner: counts.bounds.min };
     let points = sample::sample(stream, &schema, &header, wanted, progress)?;
@@ -65,4 +69,12 @@ pub fn write_preview(
     let nodes = tree::spread(&points, &mut header);
     let bytes = file::write(target, &header, &nodes, &points)?;
     Ok(PreviewReport { points: header.points, baked: header.baked, nodes: nodes.len() as u64, bytes })
+}
+
+/// The attribute that holds the error of the coefficients of the attribute `name`: it is called after it.
+fn find_error(schema: &Schema, name: &str) -> Option<usize> {
+    let column = schema.find(&format!("{name}_error"))?;
+    let attribute = &schema.attributes[column];
+    let is_number = matches!(attribute.value_type, ValueType::F16 | ValueType::F32);
+    (is_number && attribute.components == 1).then_some(column)
 }

@@ -2,7 +2,7 @@
 
 use glam::{DVec3, Vec3};
 
-use super::file::{Header, RECORD_HEAD_BYTES};
+use super::file::Header;
 use crate::Result;
 use crate::math::hash::combine;
 use crate::relight::draw::{ALBEDO_DEFAULT, Columns};
@@ -47,11 +47,36 @@ impl Points {
         let bytes = header.record_bytes() - POSITION_BYTES;
         &self.records[point as usize * bytes..][..bytes]
     }
+
+    /// Adds a record without its position: normal, albedo, coefficients and, where there is one, their error.
+    pub fn push_record(
+        &mut self,
+        header: &Header,
+        normal: Vec3,
+        albedo: Vec3,
+        numbers: impl Iterator<Item = f32>,
+    ) {
+        let end = self.records.len() + header.record_bytes() - POSITION_BYTES;
+        for value in octahedral(normal) {
+            self.records.extend_from_slice(&value.to_le_bytes());
+        }
+        self.records.extend(albedo.to_array().map(srgb_byte));
+        self.records.push(0);
+        for number in numbers {
+            self.records.extend_from_slice(&half::f16::from_f32(number).to_le_bytes());
+        }
+        self.records.resize(end, 0);
+    }
 }
 
 /// Bytes that a point costs while the preview is made: itself, and its place in lists of the tree.
 pub(super) fn bytes_per_point(header: &Header) -> u64 {
     (header.record_bytes() + size_of::<Vec3>() + 4 * size_of::<u32>()) as u64
+}
+
+/// What orders points, and chooses among them: the vertex's number, stirred.
+pub(super) fn hash(vertex: u64) -> u32 {
+    combine(combine(0x0070_7265, vertex as u32), (vertex >> 32) as u32)
 }
 
 /// Reads the stream once and keeps what the hash chooses.
@@ -73,7 +98,7 @@ pub(super) fn sample(
     stream.rewind()?;
     while stream.next(&mut grid)? {
         for vertex in 0..grid.vertex_count() {
-            let hash = combine(combine(0x0070_7265, number as u32), (number >> 32) as u32);
+            let hash = hash(number);
             number += 1;
             if !columns.is_baked(schema, &grid, vertex) {
                 continue;
@@ -87,26 +112,14 @@ pub(super) fn sample(
             let unit = normal.map_or(Vec3::ZERO, |column| grid.vec3(schema, column, vertex));
             let color =
                 albedo.map_or(Vec3::splat(ALBEDO_DEFAULT), |column| grid.vec3(schema, column, vertex));
-            push_record(&mut points.records, unit, color);
-            for coefficient in 0..header.coefficients() {
-                let value = grid.value(schema, header.column, vertex, coefficient);
-                points.records.extend_from_slice(&half::f16::from_f32(value).to_le_bytes());
-            }
-            let padding = header.record_bytes() - RECORD_HEAD_BYTES - 2 * header.coefficients();
-            points.records.resize(points.records.len() + padding, 0);
+            let (column, error) = header.columns;
+            let numbers = (0..header.coefficients()).map(|number| grid.value(schema, column, vertex, number));
+            let error = error.map(|error| grid.value(schema, error, vertex, 0));
+            points.push_record(header, unit, color, numbers.chain(error));
         }
         progress(stream.progress());
     }
     Ok(points)
-}
-
-/// Normal, albedo and a byte that is 0.
-fn push_record(records: &mut Vec<u8>, normal: Vec3, albedo: Vec3) {
-    for value in octahedral(normal) {
-        records.extend_from_slice(&value.to_le_bytes());
-    }
-    records.extend(albedo.to_array().map(srgb_byte));
-    records.push(0);
 }
 
 /// A unit vector on the octahedron unfolded to a square, 16 bits each way (Meyer et al., "On Floating-Point Normal

@@ -31,7 +31,7 @@ use view::View;
 
 use crate::error::nearest;
 use crate::math::Bounds;
-use crate::scene::{Camera, Domain, Weight};
+use crate::scene::{Camera, Domain, ShOcclusion, Weight};
 use crate::shade::sh::{BANDS_MAX, bands_of};
 use crate::stream::schema::names;
 use crate::stream::{Microgrid, MicrogridStream, Schema, ValueType};
@@ -268,8 +268,12 @@ pub fn find_attribute(schema: &Schema, asked: Option<&str>) -> Result<usize> {
 
 /// The first attribute of visibility coefficients that a stream's metadata names; none where it names none.
 pub fn noted_attribute(metadata: &[(String, String)]) -> Option<&str> {
-    let baked = |(key, value): &'_ (String, String)| value == "sh_occlusion" && key.ends_with(".shader");
-    metadata.iter().find(|entry| baked(entry)).and_then(|(key, _)| key.strip_suffix(".shader"))
+    // Other outputs of the shader are no coefficients
+    let output = |name: &str| metadata.iter().find(|(key, _)| key.strip_suffix(".output") == Some(name));
+    let is_coefficients =
+        |name: &&str| output(name).is_none_or(|(_, output)| output == ShOcclusion::COEFFICIENTS);
+    let baked = metadata.iter().filter(|(_, value)| value == "sh_occlusion");
+    baked.filter_map(|(key, _)| key.strip_suffix(".shader")).find(is_coefficients)
 }
 
 /// How an attribute was baked, as its stream's metadata says: weight, and domain where that is said.

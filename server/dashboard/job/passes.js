@@ -19,12 +19,14 @@ export function drawPasses(element, job) {
   const place = (at) => `${(100 * (at - start)) / (end - start)}%`;
   const rows = passes.map((pass) => {
     const began = pass.created_at;
+    // Open is what may run: whether anything of it does is another matter
+    const state = pass.state === "open" && pass.batches.leased === 0 ? "ready" : pass.state;
     const until = pass.ended_at ?? (["done", "failed", "cancelled"].includes(pass.state) ? began : end);
     const label = pass.reused ? "another job's work" : `${span(until - began)}`;
-    const block = h("i", { class: `span span-${pass.state}`, style: { left: place(began), width: `max(3px, calc(${place(until)} - ${place(began)}))` } });
+    const block = h("i", { class: `span span-${state}`, style: { left: place(began), width: `max(3px, calc(${place(until)} - ${place(began)}))` } });
     const many = total(pass.batches) > 1;
     return h("tr", {},
-      h("td", {}, pill(pass.state)),
+      h("td", {}, pill(state)),
       h("td", { class: "pass-name" }, h("strong", {}, NAMES[pass.kind] ?? pass.kind), h("small", { class: "quiet clip", title: pass.name }, pass.kind === "build" ? pass.name.slice(0, 12) : pass.name)),
       h("td", { class: "lane", title: AFTER[pass.kind] }, block),
       h("td", { class: "number" }, label),

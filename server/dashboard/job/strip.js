@@ -24,13 +24,17 @@ export class Strips {
     this.element = h("section", { class: "panel", "aria-label": "Segments", hidden: true });
     this.strips = new Map();
     this.redraw = () => this.strips.forEach((strip) => strip.draw());
-    addEventListener("theme", this.redraw);
+    this.recolor = () => this.strips.forEach((strip) => { strip.colors = null; strip.draw(); });
+    addEventListener("theme", this.recolor);
+    this.system = matchMedia("(prefers-color-scheme: dark)");
+    this.system.addEventListener("change", this.recolor);
     this.resize = new ResizeObserver(this.redraw);
     this.resize.observe(this.element);
   }
 
   end() {
-    removeEventListener("theme", this.redraw);
+    removeEventListener("theme", this.recolor);
+    this.system.removeEventListener("change", this.recolor);
     this.resize.disconnect();
   }
 
@@ -105,6 +109,37 @@ class Strip {
     this.draw(index);
   }
 
+  /** The theme's colours: a canvas knows no variables. */
+  readColors() {
+    const read = (name) => {
+      this.element.style.setProperty("color", `var(${name})`);
+      return getComputedStyle(this.element).color;
+    };
+    const names = { done: "--done", running: "--running", failed: "--failed", skipped: "--skipped", ready: "--line", text: "--text", ground: "--raised" };
+    const colors = Object.fromEntries(Object.entries(names).map(([key, name]) => [key, read(name)]));
+    this.element.style.removeProperty("color");
+    return colors;
+  }
+
+  /** What is drawn where: segments, or, where they are finer than the screen, what lies under each two pixels. */
+  pieces(width) {
+    const batches = this.segments.at(-1).end;
+    const place = (batch) => (batch / batches) * width;
+    if (width / this.segments.length >= 2) {
+      const gap = width / this.segments.length > 4 ? 1 : 0;
+      return this.segments.map((segment, at) => ({ x: place(segment.first), w: Math.max(place(segment.end) - place(segment.first) - gap, 1), batches: segment.batches, first: at, last: at }));
+    }
+    const columns = new Map();
+    this.segments.forEach((segment, at) => {
+      const x = 2 * Math.floor(place(segment.first) / 2);
+      const column = columns.get(x) ?? { x, w: 2, batches: { ready: 0, leased: 0, done: 0, failed: 0, skipped: 0 }, first: at, last: at };
+      for (const key of Object.keys(column.batches)) column.batches[key] += segment.batches[key];
+      column.last = at;
+      columns.set(x, column);
+    });
+    return [...columns.values()];
+  }
+
   draw(marked = null) {
     const { canvas } = this;
     const width = canvas.clientWidth;
@@ -114,25 +149,18 @@ class Strip {
     canvas.height = HEIGHT * scale;
     const context = canvas.getContext("2d");
     context.scale(scale, scale);
-    const style = getComputedStyle(this.element);
-    const color = (name) => style.getPropertyValue(name);
-    const probe = (name) => { this.element.style.setProperty("color", `var(${name})`); const found = getComputedStyle(this.element).color; this.element.style.removeProperty("color"); return found; };
-    const colors = { done: probe("--done"), running: probe("--running"), failed: probe("--failed"), skipped: probe("--skipped"), ready: probe("--line"), begun: probe("--done"), text: probe("--text"), ground: probe("--raised") };
-    const batches = this.segments.at(-1).end;
-    const gap = width / this.segments.length > 4 ? 1 : 0;
-    this.segments.forEach((segment, index) => {
-      const x = (segment.first / batches) * width;
-      const w = Math.max(((segment.end - segment.first) / batches) * width - gap, 0.5);
-      const state = stateOf(segment.batches);
+    const colors = (this.colors ??= this.readColors());
+    this.pieces(width).forEach(({ x, w, batches, first, last }) => {
+      const state = stateOf(batches);
       context.fillStyle = colors.ready;
       context.fillRect(x, 0, w, HEIGHT - 8);
-      const done = (segment.batches.done + segment.batches.skipped) / total(segment.batches);
+      const done = (batches.done + batches.skipped) / total(batches);
       context.fillStyle = colors[state === "skipped" ? "skipped" : "done"];
       const high = (HEIGHT - 8) * done;
       context.fillRect(x, HEIGHT - 8 - high, w, high);
       if (state === "running") {
         context.fillStyle = colors.running;
-        const leased = Math.max(4, ((HEIGHT - 8) * segment.batches.leased) / total(segment.batches));
+        const leased = Math.max(4, ((HEIGHT - 8) * batches.leased) / total(batches));
         context.fillRect(x, Math.max(0, HEIGHT - 8 - high - leased), w, leased);
       }
       if (state === "failed") {
@@ -141,7 +169,7 @@ class Strip {
         context.fillStyle = colors.ground;
         if (w > 5) context.fillRect(x + w / 2 - 1, 2, 2, 4), context.fillRect(x + w / 2 - 1, 7, 2, 2);
       }
-      if (index === marked) {
+      if (marked !== null && marked >= first && marked <= last) {
         context.fillStyle = colors.text;
         context.fillRect(x, HEIGHT - 6, Math.max(w, 3), 4);
       }

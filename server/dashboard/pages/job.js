@@ -1,15 +1,16 @@
 // One job: how far it is, why it waits, what failed, what it made.
 
-import { get } from "/dashboard/api.js";
+import { get, may } from "/dashboard/api.js";
 import { h, put } from "/dashboard/dom.js";
-import { ago, bytes, count, fileName, moment, now, share, short, span } from "/dashboard/format.js";
+import { bytes, count, fileName, moment, now, share, short, span } from "/dashboard/format.js";
 import { buttons } from "/dashboard/job/actions.js";
-import { may } from "/dashboard/api.js";
 import { Batches } from "/dashboard/job/batches.js";
 import { drawFailures } from "/dashboard/job/failures.js";
+import { drawFigures } from "/dashboard/job/figures.js";
 import { drawPace } from "/dashboard/job/pace.js";
 import { drawPasses } from "/dashboard/job/passes.js";
 import { Strips } from "/dashboard/job/strip.js";
+import { drawWork } from "/dashboard/job/work.js";
 import { onEvent } from "/dashboard/live.js";
 import { bar, jobState, pill, reason, remedy, total } from "/dashboard/words.js";
 
@@ -24,8 +25,9 @@ export async function show(main, context) {
   const figures = h("section", { class: "panel", "aria-label": "Figures" });
   const failures = h("section", { class: "panel", "aria-label": "Failures", hidden: true });
   const outputs = h("section", { class: "panel", "aria-label": "Results", hidden: true });
+  const work = h("section", { class: "panel", "aria-label": "Who baked it", hidden: true });
   const batches = new Batches(id);
-  main.append(head, outputs, h("div", { class: "columns" }, h("div", {}, passes, strips.element, failures, batches.element), h("div", {}, pace, figures)));
+  main.append(head, outputs, h("div", { class: "columns" }, h("div", {}, failures, passes, strips.element, work, batches.element), h("div", {}, pace, figures)));
 
   let last = "";
   let job = null;
@@ -37,7 +39,7 @@ export async function show(main, context) {
       drawPasses(passes, job);
       drawFigures(figures, job);
     }
-    await Promise.all([strips.refresh(job), drawPace(pace, job), text !== last && drawFailures(failures, job, (pass, batch) => batches.open(pass, batch)), text !== last && batches.refresh(job)]);
+    await Promise.all([strips.refresh(job), drawPace(pace, job), text !== last && drawFailures(failures, job, (pass, batch) => batches.open(pass, batch)), text !== last && drawWork(work, job), text !== last && batches.refresh(job)]);
     if (job.state === "succeeded" && (outputs.hidden || text !== last)) await drawOutputs(outputs, job);
     last = text;
   };
@@ -46,6 +48,11 @@ export async function show(main, context) {
   let pending = 0;
   context.while(onEvent((event) => {
     if (event.job !== id) return;
+    if (event.kind === "progress") {
+      job = { ...job, batches: event.batches, waiting: event.now.waiting, left_ms: event.now.left_ms };
+      drawHead(head, job, refresh);
+      return;
+    }
     clearTimeout(pending);
     pending = setTimeout(again, 200);
   }));
@@ -67,7 +74,7 @@ function drawHead(element, job, refresh) {
     h("p", { class: "crumbs" }, h("a", { href: "/jobs" }, "Jobs"), " / ", h("span", { class: "mono" }, job.id)),
     h("div", { class: "bar-row" }, h("h1", {}, job.name), pill(jobState(job)), h("span", { class: "grow" }),
       h("a", { class: "button", href: `/jobs/${job.id}/report` }, "Report"),
-      job.state === "succeeded" && h("a", { class: "button primary", href: `/jobs/${job.id}/bake` }, "See the bake"),
+      job.batches.done > 0 && h("a", { class: job.state === "succeeded" ? "button primary" : "button", href: `/jobs/${job.id}/bake` }, job.state === "succeeded" ? "See the bake" : "See it so far"),
       may("submitter") && buttons(job, refresh)),
     h("p", { class: "facts" }, facts.map((fact) => h("span", {}, fact))),
     job.comment && h("p", { class: "comment" }, job.comment),
@@ -83,31 +90,6 @@ function notice(job, final) {
   return h("div", { class: "notice", role: "note" }, h("span", { class: "tone-paused", "aria-hidden": "true" }, "‖"), h("p", {}, h("strong", {}, `Waits: ${reason(job.waiting).toLowerCase()}. `), remedy(job.waiting), job.reason && h("small", { class: "quiet" }, ` (${job.reason})`),
     job.requires.length > 0 && h("small", {}, ` Asks for: ${job.requires.join(", ")}.`), job.depends_on.length > 0 && job.state === "blocked" && h("small", {}, " After: ", job.depends_on.map((other) => h("a", { href: `/jobs/${other}` }, other)), ".")));
 }
-
-function drawFigures(element, job) {
-  const result = (kind) => job.passes.filter((pass) => pass.kind === kind && pass.result).map((pass) => pass.result);
-  const sum = (kind, key) => result(kind).reduce((all, one) => all + one[key], 0);
-  const bakes = job.passes.filter((pass) => pass.kind === "bake");
-  const mean = bakes.filter((pass) => pass.batch_ms > 0);
-  const bricks = sum("build", "bricks");
-  const micropolygons = sum("build", "micropolygons");
-  const rows = [
-    ["Points", sum("plan", "points") && count(sum("plan", "points"))],
-    ["Baked", sum("merge", "points") && `${count(sum("merge", "baked"))} (${share(sum("merge", "baked"), sum("merge", "points"))})`],
-    ["Batch, mean", mean.length && span(mean.reduce((all, pass) => all + pass.batch_ms, 0) / mean.length)],
-    ["Bricks", bricks && count(bricks)],
-    ["Brick maps", bricks && bytes(sum("build", "bytes"))],
-    ["Micropolygons", micropolygons && `${short(micropolygons)}, ${(sum("build", "bytes") / micropolygons).toFixed(1)} B each`],
-    ["Maps of other jobs used", job.passes.filter((pass) => pass.reused).length || null],
-    ["Result", sum("merge", "bytes") && bytes(sum("merge", "bytes"))],
-  ].filter(([, value]) => value);
-  const { settings } = job;
-  const asked = Object.entries({ "Rays per point": settings.samples, "Points at most": settings.max_points, "Level of detail": settings.lod, "Far field": settings.far_field, Seed: settings.seed || null, Frame: settings.frame }).filter(([, value]) => value !== undefined && value !== null);
-  put(element, h("h2", {}, "Figures"), rows.length === 0 ? h("p", { class: "quiet" }, "None yet.") : list(rows), asked.length > 0 && [h("h2", { class: "later" }, "Asked for"), list(asked)],
-    job.resubmit_of && h("p", { class: "quiet" }, "Submitted again from ", h("a", { href: `/jobs/${job.resubmit_of}` }, job.resubmit_of)));
-}
-
-const list = (rows) => h("dl", {}, rows.map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
 
 async function drawOutputs(element, job) {
   const manifest = await get(`/v1/jobs/${job.id}/manifest`);

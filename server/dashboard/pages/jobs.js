@@ -1,6 +1,7 @@
 // All jobs: filtered, sorted and paged by the coordinator, acted on in bulk.
 
-import { change, get, may, query } from "/dashboard/api.js";
+import { get, may, query } from "/dashboard/api.js";
+import { attention, line } from "/dashboard/attention.js";
 import { h, put, say } from "/dashboard/dom.js";
 import { ago, count, now, share, short, span } from "/dashboard/format.js";
 import { bulk } from "/dashboard/job/actions.js";
@@ -8,6 +9,8 @@ import { onEvent } from "/dashboard/live.js";
 import { sayCount, Table } from "/dashboard/table.js";
 import { bar, jobState, pill, reason, total } from "/dashboard/words.js";
 
+/** Lines of what needs attention. */
+const LATE_MAX = 3;
 const STATES = ["", "running", "ready", "blocked", "failed", "succeeded", "cancelled"];
 const FINAL = ["succeeded", "failed", "cancelled"];
 
@@ -24,10 +27,10 @@ const columns = [
   { name: "Progress", className: "c-bar", render: (job) => [bar(job.batches), h("span", { class: "figure" }, total(job.batches) ? `${short(job.batches.done)} / ${short(total(job.batches))}` : "–")] },
   { name: "Left", className: "c-number", render: (job) => (job.live?.left_ms ? h("span", { title: "at the present pace" }, span(job.live.left_ms)) : job.ended_at && job.started_at ? h("span", { class: "quiet", title: "took" }, span(job.ended_at - job.started_at)) : "–") },
   { name: "Rate", className: "c-number c-rate", render: (job) => (job.live?.per_minute ? `${short(job.live.per_minute)}/m` : "–") },
-  { name: "Running", className: "c-number", render: (job) => (job.batches.leased ? count(job.batches.leased) : "–") },
-  { name: "Failed", className: "c-number", render: (job) => (job.batches.failed ? h("strong", { class: "tone-failed" }, count(job.batches.failed)) : "–") },
+  { name: "Running", className: "c-tiny", render: (job) => (job.batches.leased ? count(job.batches.leased) : "–") },
+  { name: "Failed", className: "c-tiny", render: (job) => (job.batches.failed ? h("strong", { class: "tone-failed" }, count(job.batches.failed)) : "–") },
   { name: "Waits for", className: "c-reason", render: (job) => (FINAL.includes(job.state) ? h("span", { class: "quiet clip", title: job.reason }, job.reason || "–") : h("span", { class: job.live?.waiting === "flowing" ? "quiet" : "tone-paused", title: job.reason }, job.live ? reason(job.live.waiting) : "–")) },
-  { name: "Priority", sort: "priority", className: "c-number", render: (job) => job.priority },
+  { name: "Prio", sort: "priority", className: "c-tiny", render: (job) => job.priority },
   { name: "Owner", sort: "owner", className: "c-owner", render: (job) => job.submitted_by },
   { name: "Age", sort: "created", className: "c-number c-age", render: (job) => h("span", { title: ago(job.created_at) }, span(now() - job.created_at)) },
 ];
@@ -46,6 +49,7 @@ export async function show(main, context) {
   const project = h("select", { "aria-label": "Project" }, h("option", { value: "" }, "All projects"));
   const actions = h("div", { class: "bulk", hidden: true });
   const summary = h("div", { class: "cards" });
+  const late = h("section", { class: "attention", "aria-label": "Needs attention", hidden: true });
   const table = new Table({
     columns, label: "Jobs", id: (job) => job.id, open: (job) => context.go(`/jobs/${job.id}`),
     fetch: async (offset, limit) => {
@@ -86,23 +90,35 @@ export async function show(main, context) {
   project.addEventListener("change", changed);
   main.classList.add("fill");
   context.while(() => main.classList.remove("fill"));
-  main.append(h("div", { class: "bar-row" }, h("h1", {}, "Jobs"), counter, h("span", { class: "grow" }), search, state, project), summary, actions, table.element);
+  main.append(h("div", { class: "bar-row" }, h("h1", {}, "Jobs"), counter, h("span", { class: "grow" }), search, state, project), summary, late, actions, table.element);
 
   const refresh = async () => {
-    const [farm] = await Promise.all([get("/v1/farm"), table.refresh()]).catch(() => [null]);
+    const [farm] = await Promise.all([get("/v1/farm"), table.refresh(), drawLate(late)]).catch(() => [null]);
     sayCount(counter, table, "job");
     if (farm) drawFarm(summary, farm);
   };
   let pending = 0;
   const soon = () => { clearTimeout(pending); pending = setTimeout(refresh, 300); };
-  context.while(onEvent(soon));
-  const timer = setInterval(() => { if (!document.hidden) refresh(); }, 3_000);
+  // How far a job is comes by itself; the rest is asked for
+  context.while(onEvent((event) => {
+    if (event.kind === "progress") table.patch(event.job, (job) => ({ ...job, batches: event.batches, live: event.now }));
+    else soon();
+  }));
+  const timer = setInterval(() => { if (!document.hidden) refresh(); }, 4_000);
   context.while(() => { clearInterval(timer); clearTimeout(pending); clearTimeout(typing); table.end(); });
   table.drawHead(filter.sort, filter.order);
-  const [projects] = await Promise.all([get("/v1/projects"), table.reset(), get("/v1/farm").then((farm) => drawFarm(summary, farm))]);
+  const [projects] = await Promise.all([get("/v1/projects"), table.reset(), get("/v1/farm").then((farm) => drawFarm(summary, farm)), drawLate(late)]);
   projects.forEach(({ name }) => project.append(h("option", { value: name, selected: name === filter.project }, name)));
   sayCount(counter, table, "job");
   return "Jobs";
+}
+
+/** The jobs that need somebody most, with why and what to do. */
+async function drawLate(element) {
+  const { found } = await attention();
+  element.hidden = found.length === 0;
+  put(element, h("h2", {}, "Needs attention ", h("span", { class: "quiet" }, count(found.length))), h("ul", {}, found.slice(0, LATE_MAX).map(line)),
+    found.length > LATE_MAX && h("p", {}, h("a", { href: "/stuck" }, `and ${count(found.length - LATE_MAX)} more`)));
 }
 
 /** The farm at a glance: who works, what could run, and what every job that waits waits for. */

@@ -1,17 +1,9 @@
 // What does not move: leases that last far longer than their like, and jobs that wait, with why and what to do.
 
-import { get, query } from "/dashboard/api.js";
+import { STUCK_LEAST_MS, STUCK_TIMES, attention, expected, isStuck, line } from "/dashboard/attention.js";
 import { h, put } from "/dashboard/dom.js";
 import { count, now, span } from "/dashboard/format.js";
 import { pill, reason, remedy } from "/dashboard/words.js";
-
-const STATES = ["running", "ready", "blocked"];
-/** A lease counts as stuck when it lasts as many times as long as its batches should, and this long. */
-const [TIMES, LEAST_MS] = [8, 10 * 60_000];
-
-/** Milliseconds that a lease should take. */
-const expected = (lease) => lease.batches * lease.batch_ms;
-const isStuck = (lease) => now() - lease.granted_at > Math.max(LEAST_MS, TIMES * expected(lease));
 
 const headings = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name))));
 
@@ -28,7 +20,7 @@ function drawLeases(element, leases) {
         h("td", { class: "number" }, count(lease.batches)), h("td", { class: "number" }, span(took)),
         h("td", { class: "number" }, expected(lease) ? span(expected(lease)) : "not known yet"),
         h("td", { class: "number" }, share === null ? "–" : `${Math.round(100 * share)} %`)))))),
-    h("p", { class: "quiet" }, `Stuck means: longer than ${span(LEAST_MS)}, and than ${TIMES} times what its batches should take. Look at the worker first; locking it lets others take over when its lease runs out.`));
+    h("p", { class: "quiet" }, `Stuck means: longer than ${span(STUCK_LEAST_MS)}, and than ${STUCK_TIMES} times what its batches should take. Look at the worker first; locking it lets others take over when its lease runs out.`));
 }
 
 function drawJobs(element, jobs) {
@@ -45,13 +37,18 @@ function drawJobs(element, jobs) {
 }
 
 export async function show(main, context) {
+  const late = h("section", { class: "attention", "aria-label": "Needs attention", hidden: true });
   const leases = h("section", { class: "panel", "aria-label": "Running batches" });
   const held = h("section", { class: "panel", "aria-label": "Jobs that wait" });
-  main.append(h("div", { class: "bar-row" }, h("h1", {}, "Stuck")), held, leases);
+  main.append(h("div", { class: "bar-row" }, h("h1", {}, "Stuck")), late, held, leases);
   const refresh = async () => {
-    const [running, ...pages] = await Promise.all([get("/v1/leases"), ...STATES.map((state) => get(query("/v1/jobs", { state, limit: 500, sort: "created", order: "asc" })))]);
+    const { found, leases: running, live } = await attention();
+    // Those that wait stand below, by reason
+    const others = found.filter((trouble) => !trouble.shared);
+    late.hidden = others.length === 0;
+    put(late, h("h2", {}, "Needs attention ", h("span", { class: "quiet" }, count(others.length))), h("ul", {}, others.map(line)));
     drawLeases(leases, running);
-    drawJobs(held, pages.flatMap((page) => page.jobs.map((job) => ({ ...job, live: page.live?.[job.id] }))));
+    drawJobs(held, live);
   };
   await refresh();
   const timer = setInterval(() => { if (!document.hidden) refresh().catch(() => null); }, 3_000);

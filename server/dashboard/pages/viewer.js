@@ -1,57 +1,19 @@
 // The bake itself: points under a light that the artist turns.
 
-import { get, query } from "/dashboard/api.js";
+import { get } from "/dashboard/api.js";
 import { tell, tellProblem } from "/dashboard/dialog.js";
 import { h, put } from "/dashboard/dom.js";
+import { ago, count } from "/dashboard/format.js";
+import { onEvent } from "/dashboard/live.js";
 import { Camera, steer } from "/dashboard/viewer/camera.js";
 import { Lights } from "/dashboard/viewer/light.js";
 import { account, controls, describe, drawBall } from "/dashboard/viewer/panel.js";
-import { Preview } from "/dashboard/viewer/preview.js";
 import { Renderer } from "/dashboard/viewer/renderer.js";
+import { candidates, open, openOther, sourcesOf } from "/dashboard/viewer/sources.js";
+import { readState, writeState } from "/dashboard/viewer/state.js";
 
 const BUDGET = 3_000_000;
 const FRAME_MS = 40;
-
-/** What the address says about a view: everything that a link restores. */
-function readState() {
-  const asked = new URLSearchParams(location.hash.slice(1));
-  const vector = (name) => {
-    const values = (asked.get(name) ?? "").split(",").map(Number);
-    return values.length === 3 && values.every(Number.isFinite) ? values : null;
-  };
-  const number = (name, otherwise) => (asked.has(name) && Number.isFinite(Number(asked.get(name))) ? Number(asked.get(name)) : otherwise);
-  return { show: asked.get("show") ?? "lit", env: asked.get("env") ?? "sky", rotation: number("rot", 0), stops: number("stops", 0), tint: vector("tint") ?? [1, 1, 1], compare: asked.get("compare") ?? "one", other: asked.get("with") ?? "", gain: number("gain", 4), eye: vector("eye"), at: vector("at"), fov: number("fov", 35) };
-}
-
-/** The address of a view. */
-function writeState(state, camera) {
-  const values = (list) => list.map((value) => Number(value.toPrecision(9))).join(",");
-  const said = new URLSearchParams({ show: state.show, env: state.env, rot: state.rotation, stops: state.stops, eye: values(camera.eye), at: values(camera.target), fov: camera.fov });
-  if (state.tint.some((value) => value !== 1)) said.set("tint", values(state.tint));
-  if (state.other) said.set("with", state.other), said.set("compare", state.compare), said.set("gain", state.gain);
-  return `${location.pathname}${location.search}#${said}`;
-}
-
-/** The outputs that can be looked at: those of a job. */
-async function outputsOf(job) {
-  const { outputs } = await get(`/v1/jobs/${job}/manifest`);
-  return outputs.filter((output) => output.preview);
-}
-
-/** The preview of a job's bake set. */
-async function load(job, set) {
-  const preview = new Preview(`/v1/jobs/${job}/outputs/${encodeURIComponent(`${set}.mgs`)}/preview`);
-  await preview.open();
-  return preview;
-}
-
-/** Other bakes that this one can be compared with: its own job's other sets, and late jobs of the same project. */
-async function candidates(job, set, outputs) {
-  const own = outputs.map((output) => output.name.replace(/\.mgs$/, "")).filter((name) => name !== set).map((name) => [`${job.id}/${name}`, `${name}, of this job`]);
-  const page = await get(query("/v1/jobs", { project: job.project, state: "succeeded", limit: 30 }));
-  const others = page.jobs.filter((other) => other.id !== job.id).map((other) => [`${other.id}/${set}`, `${other.name}, ${new Date(other.created_at).toLocaleString("en-GB", { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit" })}`]);
-  return [...own, ...others];
-}
 
 /** The box of a preview, by its root's points. */
 function box(layer) {
@@ -64,11 +26,13 @@ function box(layer) {
 
 export async function show(main, context) {
   const { id } = context;
-  const [job, outputs] = await Promise.all([get(`/v1/jobs/${id}`), outputsOf(id)]);
-  if (outputs.length === 0) throw new Error("this job has no preview: its bake has no spherical harmonics, or is older than previews");
-  const sets = outputs.map((output) => output.name.replace(/\.mgs$/, ""));
+  const job = await get(`/v1/jobs/${id}`);
+  const sources = await sourcesOf(job);
+  if (sources.length === 0) throw new Error(job.state === "succeeded" ? "this job has no preview: its bake has no spherical harmonics, or is older than previews" : "no batch of this job is done: there is nothing to see yet");
+  const sets = sources.map(({ set }) => set);
   const asked = new URLSearchParams(location.search).get("set");
-  const set = sets.includes(asked) ? asked : sets[0];
+  let source = sources.find(({ set }) => set === asked) ?? sources[0];
+  const { set } = source;
   const state = readState();
   const lights = new Lights();
   const canvas = h("canvas", { class: "view", tabindex: "0", role: "img", "aria-label": `The bake ${set} as points. Drag or arrow keys turn it, + and - zoom, [ and ] turn the light, R shows all of it.` });
@@ -76,19 +40,20 @@ export async function show(main, context) {
   const point = h("div", { class: "viewer-point" });
   const side = h("aside", { class: "viewer-side", "aria-label": "Light and view" });
   const names = h("div", { class: "viewer-names", "aria-hidden": "true" });
+  const sofar = h("p", { class: "viewer-sofar", role: "status", hidden: !source.sofar });
   main.classList.add("fill");
   context.while(() => main.classList.remove("fill"));
   main.append(h("div", { class: "bar-row" }, h("p", { class: "crumbs" }, h("a", { href: "/jobs" }, "Jobs"), " / ", h("a", { href: `/jobs/${id}` }, job.name), " / "), h("h1", {}, set),
     sets.length > 1 && h("select", { "aria-label": "Bake set", onchange: (event) => context.go(`/jobs/${id}/bake?set=${encodeURIComponent(event.target.value)}`) }, sets.map((name) => h("option", { value: name, selected: name === set }, name)))),
-    h("div", { class: "viewer" }, h("div", { class: "viewer-stage" }, canvas, names, status), side));
+    h("div", { class: "viewer" }, h("div", { class: "viewer-stage" }, canvas, names, sofar, status), side));
 
   let dirty = true;
   let running = true;
   let [budget, slow] = [BUDGET, 0];
   const changed = () => { dirty = true; };
   const renderer = new Renderer(canvas, changed);
-  const [preview] = await Promise.all([load(id, set), lights.load()]);
-  const layer = renderer.add(preview);
+  const [preview] = await Promise.all([open(source.url), lights.load()]);
+  let layer = renderer.add(preview);
   const { header } = preview;
   const camera = new Camera(header.zUp);
   camera.fov = state.fov;
@@ -119,9 +84,8 @@ export async function show(main, context) {
     renderer.layers.length = 1;
     state.compare = other ? (state.compare === "one" ? "side" : state.compare) : "one";
     if (other) {
-      const [otherJob, otherSet] = other.split("/");
       try {
-        renderer.add(await load(otherJob, otherSet));
+        renderer.add(await openOther(other));
       } catch (problem) {
         tellProblem(problem, "That bake cannot be compared");
         [state.other, state.compare] = ["", "one"];
@@ -147,7 +111,30 @@ export async function show(main, context) {
     if (navigator.clipboard) await navigator.clipboard.writeText(location.href).then(() => tell("The link is copied: it restores this view."), () => tell("The address of this page restores this view."));
     else tell("The address of this page restores this view.");
   };
-  const others = await candidates(job, set, outputs);
+  const saySofar = () => put(sofar, h("strong", {}, `${count(source.sofar.done)} of ${count(source.sofar.batches)} batches`), ` so far, as of ${ago(source.sofar.made_at)}`);
+  // What there is so far is looked at anew as long as it grows; the result takes its place
+  const renew = async () => {
+    const now = await get(`/v1/jobs/${id}`);
+    if (now.state === "succeeded") {
+      context.go(writeState(state, camera));
+      return;
+    }
+    const found = (await sourcesOf(now)).find((other) => other.set === set);
+    if (running && found && found.url !== source.url) {
+      await renderer.replace(layer, await open(found.url), (next) => next.light(lights.matrix(state, next.preview.header)));
+      [layer, source] = [renderer.layers[0], found];
+      relight();
+    }
+    saySofar();
+  };
+  function follow() {
+    const again = () => { if (!document.hidden) renew().catch(() => null); };
+    const timers = [setInterval(again, 10_000), setInterval(saySofar, 1_000)];
+    const silence = onEvent((event) => { if (event.job === id && event.kind === "job.succeeded") again(); });
+    saySofar();
+    return () => { timers.forEach(clearInterval); silence(); };
+  }
+  const others = await candidates(job, set, sets);
   const panel = controls(state, header, lights, others, { change, dropped: dropHdr, reset, share, compareWith });
   side.append(panel.element, point);
   describe(point, null);
@@ -172,6 +159,7 @@ export async function show(main, context) {
   else camera.frame(...box(layer), canvas.clientWidth / canvas.clientHeight);
   camera.radius = header.edge;
   relight();
+  if (source.sofar) context.while(follow());
   if (state.other) await compareWith(state.other);
   else if (state.compare !== "one") state.compare = "one";
   panel.sync();

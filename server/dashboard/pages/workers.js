@@ -5,6 +5,7 @@ import { ask, tell, tellProblem } from "/dashboard/dialog.js";
 import { h, put } from "/dashboard/dom.js";
 import { ago, bytes, count, now, span } from "/dashboard/format.js";
 import { Table, sayCount } from "/dashboard/table.js";
+import { bytesPerRay, cacheHitsCell, raysPerSecond } from "/dashboard/traced.js";
 import { pill } from "/dashboard/words.js";
 
 const ORDER = ["sick", "lost", "locked", "draining", "busy", "idle"];
@@ -33,13 +34,14 @@ export async function show(main, context) {
   let workers = [];
   const columns = [
     { name: "State", className: "c-state", render: (worker) => pill(worker.state) },
-    { name: "Worker", className: "c-name", render: (worker) => h("span", { class: "two" }, h("strong", {}, worker.name), h("small", {}, worker.labels.join(" · ") || "no labels")) },
+    { name: "Worker", className: "c-name", render: (worker) => h("span", { class: "two" }, h("strong", {}, worker.name), h("small", {}, [worker.version && `version ${worker.version}`, ...worker.labels].filter(Boolean).join(" · ") || "no labels")) },
     { name: "Now", className: "c-now", render: (worker) => (worker.lease ? h("span", { class: "two" }, h("a", { href: `/jobs/${worker.lease.job}` }, worker.lease.job_name), h("small", {}, `${worker.lease.kind} ${worker.lease.kind === "build" ? "" : worker.lease.name}, segment ${worker.lease.segment}`)) : h("span", { class: "quiet" }, "–")) },
-    { name: "Batches", className: "c-number", render: (worker) => (worker.leased ? count(worker.leased) : "–") },
-    { name: "For", className: "c-number", render: (worker) => (worker.lease ? span(now() - worker.lease.granted_at) : "–") },
+    { name: "For", className: "c-number", render: (worker) => (worker.lease ? h("span", { title: `${count(worker.leased)} batches` }, span(now() - worker.lease.granted_at)) : "–") },
+    { name: "Device", className: "c-device", render: (worker) => h("span", { class: "two", title: worker.device }, h("span", {}, worker.device || "not known yet"), h("small", {}, worker.memory_bytes ? `${bytes(worker.memory_bytes)} of memory` : "")) },
+    { name: "Rays", className: "c-number", render: (worker) => raysPerSecond(worker.traced) ?? "–" },
+    { name: "Cache hits", className: "c-number", render: (worker) => cacheHitsCell(worker.traced) },
+    { name: "Per ray", className: "c-number c-rate", render: (worker) => h("span", { title: "bytes that it reads for each ray" }, bytesPerRay(worker.traced) ?? "–") },
     { name: "Errors", className: "c-number", render: (worker) => (worker.errors ? h("strong", { class: "tone-failed", title: "batches of which it was to blame lately; at five it rests for half an hour" }, `${count(worker.errors)} of 5`) : "–") },
-    { name: "Memory", className: "c-number c-rate", render: (worker) => (worker.memory_bytes ? bytes(worker.memory_bytes) : "–") },
-    { name: "Version", className: "c-project", render: (worker) => worker.version || "–" },
     { name: "Heard", className: "c-age", render: (worker) => ago(worker.last_seen) },
     may("admin") && { name: "", className: "c-actions", render: (worker) => Object.entries(ACTIONS).filter(([, action]) => action.fits(worker)).map(([key, action]) => h("button", { onclick: () => act(key, worker, refresh) }, action.name)) },
   ].filter(Boolean);
@@ -52,6 +54,7 @@ export async function show(main, context) {
     },
     empty: () => h("div", { class: "empty" }, h("h2", {}, workers.length ? "No worker matches" : "No workers yet"), workers.length ? null : h("p", {}, "Start one with ", h("code", {}, "pantaray worker --token-file worker.token"), ".")),
   });
+  table.element.classList.add("tall");
   const refresh = async () => {
     const [all, leases] = await Promise.all([get("/v1/workers"), get("/v1/leases")]);
     const by = new Map(leases.map((lease) => [lease.worker, lease]));

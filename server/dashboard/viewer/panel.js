@@ -4,12 +4,13 @@ import { h, put } from "/dashboard/dom.js";
 import { bytes, count, short } from "/dashboard/format.js";
 import { basis, radiance } from "/dashboard/viewer/sh.js";
 
-/** What can be looked at, for so many bands. */
-function shows(bands) {
+/** What can be looked at, for what a preview has. */
+function shows({ bands, hasError, hasAlbedo }) {
   const all = [["lit", "Lit"], ["sky", "Sky visibility"]];
   if (bands > 1) all.push(["bent", "Bent normal"]);
   for (let band = 0; band < bands; band += 1) all.push([`band${band}`, `Band ${band} alone`]);
-  return [...all, ["normal", "Normal"], ["albedo", "Albedo"]];
+  if (hasError) all.push(["error", "Sample error"]);
+  return [...all, ["normal", "Normal"], hasAlbedo && ["albedo", "Albedo"]].filter(Boolean);
 }
 
 const LEGENDS = {
@@ -17,7 +18,8 @@ const LEGENDS = {
   bent: "The direction from which most light comes: red is x, green y, blue z; grey is none.",
   band: "What this band says along the normal: orange is more than nothing, blue less.",
   normal: "Red is x, green y, blue z.",
-  difference: "Orange: the first is brighter. Blue: the second is. Dark grey: only one of them has a point there.",
+  error: "How far off the coefficients may be, from two halves of the rays: black is exact, white 0.03 and more. Bright parts want more rays; exposure scales it.",
+  difference: "White: both are alike. Orange: the first is brighter. Blue: the second is. Dark grey: only one of them has a point there.",
 };
 
 /** The controls; `change(what)` is called after each. */
@@ -27,7 +29,7 @@ export function controls(state, header, lights, others, { change, dropped, reset
     const input = h("input", { type: "range", min, max, step, value: String(state[key]), "aria-label": label, oninput: () => { state[key] = Number(input.value); value.textContent = `${state[key]}${unit}`; change(key); } });
     return { row: h("label", { class: "slider" }, h("span", {}, label), value, input), set: () => { input.value = String(state[key]); value.textContent = `${Math.round(state[key] * 100) / 100}${unit}`; } };
   };
-  const show = h("select", { "aria-label": "Show", onchange: () => { state.show = show.value; change("show"); legend(); } }, shows(header.bands).map(([key, name]) => h("option", { value: key, selected: key === state.show }, name)));
+  const show = h("select", { "aria-label": "Show", onchange: () => { state.show = show.value; change("show"); legend(); } }, shows(header).map(([key, name]) => h("option", { value: key, selected: key === state.show }, name)));
   const env = h("select", { "aria-label": "Environment", onchange: () => { state.env = env.value; change("env"); } });
   const fillLights = () => put(env, [...lights.all].map(([key, { name }]) => h("option", { value: key, selected: key === state.env }, name)));
   fillLights();
@@ -37,7 +39,7 @@ export function controls(state, header, lights, others, { change, dropped, reset
   const hex = (tint) => `#${tint.map((value) => Math.round(255 * Math.min(1, value)).toString(16).padStart(2, "0")).join("")}`;
   const tint = h("input", { type: "color", value: hex(state.tint), "aria-label": "Tint", oninput: () => { state.tint = [1, 3, 5].map((at) => parseInt(tint.value.slice(at, at + 2), 16) / 255); change("tint"); } });
   const file = h("input", { type: "file", accept: ".hdr", class: "visually-hidden", id: "hdr", onchange: () => file.files[0] && dropped(file.files[0]) });
-  const ball = h("canvas", { width: 72, height: 72, class: "ball", "aria-hidden": "true" });
+  const ball = h("canvas", { width: 48, height: 48, class: "ball", "aria-hidden": "true" });
   const legendLine = h("p", { class: "quiet legend-line" });
   const legend = () => put(legendLine, state.compare === "difference" ? LEGENDS.difference : LEGENDS[state.show.startsWith("band") ? "band" : state.show] ?? "");
   const with_ = h("select", { "aria-label": "Compare with", onchange: () => compareWith(with_.value) }, h("option", { value: "" }, "nothing"), others.map(([value, name]) => h("option", { value, selected: value === state.other }, name)));
@@ -108,7 +110,7 @@ export function describe(element, found, state, matrix) {
   const bands = Array.from({ length: header.bands }, (_, l) => [`Band ${l}`, found.visibility.slice(l * l, (l + 1) ** 2).map(number).join(" ")]);
   put(element, h("h2", {}, "Point"), h("dl", { class: "numbers" },
     row("Position", found.place.map(number).join(" ")), row("Normal", found.normal ? found.normal.map(number).join(" ") : "none"), row("Albedo", found.albedo.map(number).join(" ")),
-    row("Sky visibility", `${(100 * found.visibility[0] / found.layer.open).toFixed(1)} %`), row("Radiance", lit.map(number).join(" ")), bands.map(([name, values]) => row(name, values))));
+    row("Sky visibility", `${(100 * found.visibility[0] / found.layer.open).toFixed(1)} %`), found.error !== null && row("Sample error", number(found.error)), row("Radiance", lit.map(number).join(" ")), bands.map(([name, values]) => row(name, values))));
 }
 
 /** What is drawn, and what came over the wire. */

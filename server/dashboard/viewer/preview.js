@@ -9,6 +9,7 @@ const NODE_BYTES = 24;
 const NODES_MAX = 1 << 20;
 const NODE_DATA_MAX = 256 << 10;
 const MAGIC = "PNTRPRVW";
+const VERSION = 2;
 
 const CRC = Uint32Array.from({ length: 256 }, (_, byte) => {
   let value = byte;
@@ -43,7 +44,8 @@ export class Preview {
     let head = await this.bytes(0, FIRST_BYTES);
     const view = new DataView(head.buffer);
     if (head.length < FIXED_BYTES || String.fromCharCode(...head.subarray(0, 8)) !== MAGIC) throw new Error("the file is no preview");
-    if (view.getUint32(8, true) !== 1) throw new Error(`a preview of version ${view.getUint32(8, true)}, 1 wanted`);
+    const version = view.getUint32(8, true);
+    if (version < 1 || version > VERSION) throw new Error(`a preview of version ${version}, 1 to ${VERSION} wanted`);
     const [length, count] = [view.getUint32(12, true), view.getUint32(80, true)];
     if (count === 0 || count > NODES_MAX || length !== FIXED_BYTES + NODE_BYTES * count + 4) throw new Error("the preview's directory is damaged");
     if (length > head.length) {
@@ -77,11 +79,11 @@ function decodeHeader(view, bytes) {
     corner: [16, 24, 32].map((at) => view.getFloat64(at, true)), edge: view.getFloat64(40, true),
     points: Number(view.getBigUint64(48, true)), baked: Number(view.getBigUint64(56, true)), metersPerUnit: view.getFloat64(64, true),
     zUp: view.getUint8(72) === 1, bands: view.getUint8(73), cosineWeighted: view.getUint8(74) === 1, sphere: view.getUint8(75) === 1,
-    record: view.getUint32(76, true), hasNormals: (flags & 1) !== 0, hasAlbedo: (flags & 2) !== 0,
+    record: view.getUint32(76, true), hasNormals: (flags & 1) !== 0, hasAlbedo: (flags & 2) !== 0, hasError: (flags & 4) !== 0,
     attribute: new TextDecoder().decode(end < 0 ? name : name.subarray(0, end)),
   };
   const coefficients = header.bands * header.bands;
-  if (header.bands < 1 || header.bands > 6 || header.record !== Math.ceil((14 + 2 * coefficients) / 4) * 4 || !(header.edge > 0) || !header.corner.every(Number.isFinite)) throw new Error("the preview's header is impossible");
+  if (header.bands < 1 || header.bands > 6 || header.record !== Math.ceil((14 + 2 * (coefficients + (header.hasError ? 1 : 0))) / 4) * 4 || !(header.edge > 0) || !header.corner.every(Number.isFinite)) throw new Error("the preview's header is impossible");
   return { ...header, coefficients };
 }
 

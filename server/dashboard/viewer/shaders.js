@@ -21,8 +21,8 @@ function basisSource(bands) {
 /** Attributes that hold the coefficients: four in each, the last with what is left. */
 export const coefficientSlots = (count) => Array.from({ length: Math.ceil(count / 4) }, (_, at) => Math.min(4, count - 4 * at));
 
-/** The vertex shader for so many bands. */
-export function pointVertex(bands) {
+/** The vertex shader for so many bands, with the error of the coefficients where points have one. */
+export function pointVertex(bands, hasError) {
   const count = bands * bands;
   const slots = coefficientSlots(count);
   const swizzle = ["x", "y", "z", "w"];
@@ -34,6 +34,7 @@ layout(location = 0) in vec3 a_place;
 layout(location = 1) in ivec2 a_normal;
 layout(location = 2) in vec4 a_albedo;
 ${slots.map((size, slot) => `layout(location = ${3 + slot}) in vec4 a_sh${slot};`).join("\n")}
+${hasError ? `layout(location = ${3 + slots.length}) in float a_error;` : "const float a_error = 0.0;"}
 uniform mat4 u_clip;
 uniform vec3 u_corner;
 uniform float u_edge;
@@ -71,6 +72,12 @@ vec3 diverging(float t) {
   return t < 0.0 ? mix(vec3(0.93), vec3(0.10, 0.35, 0.72), -t) : mix(vec3(0.93), vec3(0.80, 0.33, 0.02), t);
 }
 
+// Black through red and yellow to white, evenly brighter
+vec3 heat(float t) {
+  t = clamp(t, 0.0, 1.0);
+  return clamp(vec3(t * 2.2, t * 2.0 - 0.55, t * 3.0 - 2.0), 0.0, 1.0) + vec3(0.06, 0.04, 0.12) * (1.0 - t);
+}
+
 void main() {
   vec3 place = u_corner + u_edge * a_place;
   gl_Position = u_clip * vec4(place, 1.0);
@@ -102,6 +109,9 @@ void main() {
     color = a_albedo.rgb;
   } else if (u_show == 4) {
     color = there ? 0.5 + 0.5 * n : vec3(0.5);
+  } else if (u_show == 5) {
+    // A noise of 0.03 is one that people see
+    color = heat(a_error * u_exposure / 0.03);
   } else {
     int l = u_show - 10;
     float sum = 0.0;

@@ -7,6 +7,7 @@ pub mod bytes;
 mod estimate;
 pub mod gc;
 pub mod pace;
+mod provisional;
 mod publish;
 pub mod submit;
 mod tick;
@@ -19,6 +20,7 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use protocol::events::Event;
+use protocol::overview::JobProgress;
 use protocol::work::Task;
 use tokio::sync::{Notify, broadcast};
 
@@ -62,8 +64,12 @@ pub struct Coordinator {
     assets: Mutex<HashMap<String, Arc<HashSet<String>>>>,
     /// How fast jobs go.
     pub pace: pace::Pace,
+    /// What there is to see of bakes that are under way.
+    provisionals: provisional::Provisionals,
     /// What happens, for listeners.
     pub events: broadcast::Sender<Event>,
+    /// How far jobs are, likewise.
+    pub progress: broadcast::Sender<JobProgress>,
     last_event: AtomicI64,
     stopping: AtomicBool,
     /// Wakes what waits for the end.
@@ -103,7 +109,9 @@ impl Coordinator {
             tasks: Mutex::default(),
             assets: Mutex::default(),
             pace: pace::Pace::default(),
+            provisionals: provisional::Provisionals::default(),
             events: broadcast::channel(EVENTS_MAX).0,
+            progress: broadcast::channel(EVENTS_MAX).0,
             last_event,
             stopping: AtomicBool::new(false),
             stopped: Notify::new(),

@@ -3,19 +3,26 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use protocol::overview::PaceSample;
+use protocol::job::Counts;
+use protocol::overview::{JobNow, JobProgress, PaceSample};
+use protocol::{JobState, WaitReason};
 
 use super::{Coordinator, lock};
-use crate::Result;
+use crate::scheduler::farm::Farm;
+use crate::scheduler::waiting::{Question, reason};
 
-/// Between two samples.
+/// Between two samples that are kept.
 const EVERY: Duration = Duration::from_secs(3);
+/// Between two looks while somebody listens: they hear of each job twice a second at most.
+const TOLD_EVERY: Duration = Duration::from_millis(500);
 /// Samples of one job; when there are as many, every other one is dropped.
 const SAMPLES_MAX: usize = 240;
 /// Jobs that are remembered; later ones have greater ids, so the first are the oldest.
 const JOBS_MAX: usize = 2_048;
+/// Jobs that are told of at once; of others pages ask by themselves.
+const FRAMES_MAX: usize = 500;
 /// Milliseconds over which the present pace is taken.
 const PRESENT_MS: i64 = 60_000;
 
@@ -59,26 +66,59 @@ impl Pace {
 }
 
 impl Coordinator {
-    /// Notes the pace of jobs while something runs, until the coordinator stops.
+    /// Notes the pace of jobs while something runs, and tells listeners how far they are, until the coordinator stops.
     pub async fn note_pace(self: Arc<Self>) {
+        let (mut told, mut noted) = (BTreeMap::new(), Instant::now());
         while !self.is_stopping() {
+            let is_heard = self.progress.receiver_count() > 0;
+            let pause = if is_heard { TOLD_EVERY } else { EVERY };
             let stopped = self.stopped.notified();
-            tokio::select! { () = stopped => return, () = tokio::time::sleep(EVERY) => {} }
+            tokio::select! { () = stopped => return, () = tokio::time::sleep(pause) => {} }
             if self.read_farm(|farm| farm.passes.is_empty()) {
                 continue;
             }
-            if let Err(error) = self.sample().await {
-                tracing::warn!(%error, "the pace of jobs cannot be read");
+            match self.store.counts_of_live_jobs().await {
+                Ok(jobs) => {
+                    if !is_heard || noted.elapsed() >= EVERY {
+                        noted = Instant::now();
+                        let at = self.now();
+                        jobs.iter().for_each(|(job, counts)| {
+                            self.pace.note(job, PaceSample { at, done: counts.done })
+                        });
+                    }
+                    self.tell(jobs, &mut told);
+                }
+                Err(error) => tracing::warn!(%error, "the pace of jobs cannot be read"),
             }
         }
     }
 
-    async fn sample(&self) -> Result<()> {
-        for (job, sample) in self.store.done_of_live_jobs(self.now()).await? {
-            self.pace.note(&job, sample);
+    /// Tells listeners of those jobs whose batches are not as they were `told` the last time.
+    fn tell(&self, jobs: Vec<(String, Counts)>, told: &mut BTreeMap<String, Counts>) {
+        let now = self.now();
+        let frame = |farm: &Farm, job: &String, batches: Counts| {
+            let question = Question { job, state: JobState::Running, backing_off: 0 };
+            let project = farm.jobs.get(job)?.project.clone();
+            let doing = doing(&self.pace, job, &batches, reason(farm, &question, now));
+            Some(JobProgress { job: job.clone(), project, batches, now: doing })
+        };
+        let frames: Vec<JobProgress> = self.read_farm(|farm| {
+            let changed = jobs.iter().filter(|(job, batches)| told.get(job) != Some(batches));
+            changed.filter_map(|(job, batches)| frame(farm, job, *batches)).take(FRAMES_MAX).collect()
+        });
+        *told = jobs.into_iter().collect();
+        for frame in frames {
+            // Nobody listening any more is no failure
+            let _ = self.progress.send(frame);
         }
-        Ok(())
     }
+}
+
+/// What a job does at this moment, by its pace.
+pub fn doing(pace: &Pace, job: &str, batches: &Counts, waiting: WaitReason) -> JobNow {
+    let per_minute = pace.per_minute(job);
+    let left = |rate: f64| (batches.open() as f64 / rate * 60_000.0) as i64;
+    JobNow { waiting, per_minute, left_ms: per_minute.filter(|rate| *rate > 0.0).map(left) }
 }
 
 #[cfg(test)]

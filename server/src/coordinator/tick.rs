@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::{Coordinator, lock};
 use crate::Result;
+use crate::scheduler::farm::WORKER_LOST_MS;
 
 /// Between two rounds at least.
 const ROUND: Duration = Duration::from_millis(100);
@@ -99,6 +100,16 @@ impl Coordinator {
     async fn expire(&self) -> Result<bool> {
         let ended = self.store.expire(&self.around("")).await?;
         ended.iter().for_each(|completion| self.settled(completion));
+        for worker in ended.iter().filter_map(|completion| completion.lost_worker.as_ref()) {
+            tracing::warn!(worker, "a worker is lost: its lease ran out");
+            lock(&self.seen).remove(worker);
+            let last_seen = self.now() - WORKER_LOST_MS;
+            self.write_farm(|farm| {
+                if let Some(worker) = farm.workers.get_mut(worker) {
+                    worker.last_seen = last_seen;
+                }
+            });
+        }
         Ok(!ended.is_empty())
     }
 

@@ -129,12 +129,8 @@ fn frames(request: &JobRequest) -> Result<Vec<Option<i64>>> {
     }
 }
 
-/// Reads a scene in an empty folder with the names of its files: what they hold is for workers to read.
-fn read_frames(
-    request: &JobRequest,
-    frames: &[Option<i64>],
-    roots: &Roots,
-) -> Result<(Vec<SetEstimate>, u64)> {
+/// The scene in an empty folder with the names of its files: what they hold is for workers to read.
+fn lay_out(request: &JobRequest) -> Result<(tempfile::TempDir, PathBuf)> {
     let folder = tempfile::tempdir()?;
     for path in request.files.keys() {
         let path = folder.path().join(path);
@@ -147,6 +143,25 @@ fn read_frames(
     }
     let path = folder.path().join("scene.xml");
     std::fs::write(&path, &request.scene)?;
+    Ok((folder, path))
+}
+
+/// A scene without what its files hold.
+///
+/// # Errors
+/// When it cannot be read, which it could when it was submitted.
+pub(super) fn scene_of(request: &JobRequest, frame: Option<i64>, roots: &Roots) -> Result<Scene> {
+    let (folder, path) = lay_out(request)?;
+    load_confined(&path, frame, roots).map_err(|error| refused(&error, folder.path()))
+}
+
+/// Reads a scene once for each frame.
+fn read_frames(
+    request: &JobRequest,
+    frames: &[Option<i64>],
+    roots: &Roots,
+) -> Result<(Vec<SetEstimate>, u64)> {
+    let (folder, path) = lay_out(request)?;
     let mut found = (Vec::new(), 0);
     for &frame in frames {
         let read = load_confined(&path, frame, roots).and_then(|scene| require_sets(&scene).map(|()| scene));

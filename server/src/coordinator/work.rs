@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use protocol::keys;
 use protocol::limits::{self, CLAIM_MAX};
+use protocol::traced::Traced;
 use protocol::work::{
     Claim, ClaimRequest, CompleteItem, CompleteReply, CompleteRequest, HeartbeatReply, HeartbeatRequest,
     Outcome, PROTOCOL_VERSION, RegisterReply, RegisterRequest, ReleaseRequest, Task, Verdict,
@@ -243,6 +244,7 @@ impl Coordinator {
             pass: request.pass,
             session: &request.session,
             worker: &session.worker,
+            device: &request.device,
             around: self.around(&session.worker),
             opinion_every: self.settings.opinion_every,
         };
@@ -251,6 +253,7 @@ impl Coordinator {
         log(&completion, &session.worker, request.pass, &items);
         self.settled(&completion);
         self.distrust(&completion).await?;
+        count_traced(&request.device, &completion.traced);
         metrics::histogram!("pantaray_complete_seconds").record(start.elapsed().as_secs_f64());
         for verdict in &completion.verdicts {
             let outcome = match verdict {
@@ -343,6 +346,26 @@ impl Drop for Waiting<'_> {
     fn drop(&mut self) {
         self.0.waiting.fetch_sub(1, Ordering::Relaxed);
     }
+}
+
+/// Adds what tracing took to this process's figures. Devices have too many names for a label: there are two kinds.
+fn count_traced(device: &str, traced: &Traced) {
+    if traced.batches == 0 {
+        return;
+    }
+    let kind = if device == "cpu" { "cpu" } else { "gpu" };
+    let count = |name: &'static str, value: i64| {
+        metrics::counter!(name, "device" => kind).increment(value.max(0).unsigned_abs());
+    };
+    count("pantaray_traced_batches_total", traced.batches);
+    count("pantaray_traced_points_total", traced.points);
+    count("pantaray_traced_rays_total", traced.rays);
+    count("pantaray_trace_microseconds_total", traced.trace_us);
+    count("pantaray_brick_requests_total", traced.brick_requests);
+    count("pantaray_brick_misses_total", traced.brick_misses);
+    count("pantaray_read_bytes_total", traced.read_bytes);
+    count("pantaray_device_bytes_total", traced.device_bytes);
+    count("pantaray_device_microseconds_total", traced.device_us);
 }
 
 fn check_items(request: &CompleteRequest) -> Result<()> {

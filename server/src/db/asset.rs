@@ -139,4 +139,20 @@ impl Store {
         let next = if parts.len() as i64 == limit { parts.last().map(|part| part.batch) } else { None };
         Ok(PartPage { parts, next })
     }
+
+    /// About `wanted` committed parts of a pass, spread over those that there are; and how many those are.
+    ///
+    /// # Errors
+    /// When the database refuses.
+    pub async fn some_parts(&self, pass: i64, wanted: i64) -> Result<(Vec<PartEntry>, i64)> {
+        let sql = "SELECT CAST(COALESCE(SUM(n_done), 0) AS BIGINT) FROM segment WHERE pass_id = $1";
+        let done = self.query_one(sql, values![pass]).await?.map_or(Ok(0), |row| row.int(0))?;
+        let sql = "SELECT seq, fence, sha256, bytes FROM batch
+            WHERE pass_id = $1 AND state = 2 AND bytes > 0 AND seq % $2 = 0 ORDER BY seq LIMIT $3";
+        let rows = self.query(sql, values![pass, (done / wanted).max(1), 2 * wanted]).await?;
+        let part = |row: &super::Row| {
+            Ok(PartEntry { batch: row.int(0)?, fence: row.int(1)?, sha256: row.text(2)?, bytes: row.int(3)? })
+        };
+        Ok((rows.iter().map(part).collect::<Result<Vec<_>>>()?, done))
+    }
 }

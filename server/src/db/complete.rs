@@ -4,6 +4,7 @@
 use std::collections::HashMap;
 
 use protocol::limits::{MESSAGE_BYTES_MAX, cut};
+use protocol::traced::Traced;
 use protocol::work::{ClaimedBatch, CompleteItem, Outcome, Verdict};
 use protocol::{BatchState, FailureClass, PassKind, PassState, keys};
 
@@ -23,6 +24,8 @@ pub struct Reporter<'a> {
     pub session: &'a str,
     /// The worker.
     pub worker: &'a str,
+    /// What traced.
+    pub device: &'a str,
     /// The time and the farm.
     pub around: Around,
     /// One result in so many is to be confirmed by another worker; none where this is 0.
@@ -58,6 +61,10 @@ pub struct Completion {
     pub storm: Option<String>,
     /// Workers that are not believed any more.
     pub distrusted: Vec<Distrusted>,
+    /// The worker that was not heard of for as long as the lease lasted.
+    pub lost_worker: Option<String>,
+    /// What tracing the batches took whose results count.
+    pub traced: Traced,
 }
 
 /// The lease and pass that a report is about.
@@ -98,6 +105,10 @@ impl Store {
             let counting = (&context, reporter.worker, &held[..]);
             self.complete_done(&mut tx, counting, items, &mut completion, &mut tally).await?;
             self.complete_failed(&mut tx, reporter, &context, items, &mut completion, &mut tally).await?;
+        }
+        if completion.traced.batches > 0 {
+            let whose = (context.pass, reporter.worker);
+            self.add_traced(&mut tx, whose, reporter.device, completion.traced, reporter.around.now).await?;
         }
         self.settle(&mut tx, &context, &tally, &mut completion).await?;
         self.commit("complete", tx).await?;
@@ -192,6 +203,9 @@ impl Store {
                 continue;
             }
             *verdict = Verdict::Accepted;
+            if let Some(traced) = item.traced {
+                completion.traced.add_batch(Traced { batches: 1, ..traced });
+            }
             tally.elapsed_ms += item.elapsed_ms.clamp(0, 7 * 86_400_000);
             if let Some(result) = result {
                 let key = keys::result_folder(&context.job, context.pass, item.fence);

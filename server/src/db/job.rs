@@ -89,8 +89,8 @@ impl Store {
                 _ => blocked = true,
             }
         }
-        let shot = [&request.show, &request.sequence, &request.shot].map(String::as_str).join("/");
-        let shot = shot.trim_matches('/');
+        let shot = [&request.show, &request.sequence, &request.shot].map(String::as_str);
+        let shot = &shot.into_iter().filter(|name| !name.is_empty()).collect::<Vec<_>>().join("/");
         let state = if blocked { JobState::Blocked } else { JobState::Ready };
         let reason = if blocked { "another job must succeed before" } else { "" };
         let sql = "INSERT INTO job (id, project, name, state, paused, reason, priority, running_max, failed_max,

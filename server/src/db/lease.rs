@@ -6,6 +6,7 @@ use protocol::{FailureClass, PassState};
 use super::complete::{Completion, Context, Failed, Tally};
 use super::{Store, Tx, placeholders};
 use crate::scheduler::failure::Around;
+use crate::scheduler::farm::WORKER_LOST_MS;
 use crate::{Result, values};
 
 /// Leases that end in one round at most; the next round follows at once.
@@ -98,9 +99,9 @@ impl Store {
         let mut ended = Vec::new();
         for row in rows {
             let (lease, worker) = (row.text(0)?, row.text(1)?);
-            ended.extend(
-                self.end_lease(&lease, &worker, Some(around.now), "the lease ran out", around).await?,
-            );
+            let message = "the lease ran out: its worker was not heard of";
+            let ended_one = self.end_lease(&lease, &worker, Some(around.now), message, around).await?;
+            ended.extend(ended_one.map(|completion| Completion { lost_worker: Some(worker), ..completion }));
         }
         Ok(ended)
     }
@@ -147,6 +148,11 @@ impl Store {
         let leased = self.leased(&mut tx, lease).await?;
         let lost = Back { class: FailureClass::Lost, worker, message };
         let completion = self.take_back(&mut tx, &context, &leased, &lost, around).await?;
+        if expired_at.is_some() {
+            // It did not go on with what it had: it counts as lost until it is heard of again
+            let sql = "UPDATE worker SET last_seen = $2 WHERE name = $1 AND last_seen > $2";
+            tx.execute(sql.into(), values![worker, around.now - WORKER_LOST_MS]).await?;
+        }
         self.commit("expire", tx).await?;
         metrics::counter!("pantaray_leases_expired_total").increment(1);
         Ok(Some(completion))

@@ -1,7 +1,7 @@
 //! Lists that people page through, filtered and sorted by the database: jobs, and the leases that run.
 
-use protocol::job::JobPage;
-use protocol::overview::{LeaseDetail, PaceSample};
+use protocol::job::{Counts, JobPage};
+use protocol::overview::LeaseDetail;
 use protocol::{JobState, PassKind, PassState};
 
 use super::view::{COUNTS, SUMMARY, summary};
@@ -150,11 +150,13 @@ impl Store {
     ///
     /// # Errors
     /// When the database refuses.
-    pub async fn done_of_live_jobs(&self, now: i64) -> Result<Vec<(String, PaceSample)>> {
-        let sql = "SELECT p.job_id, CAST(SUM(s.n_done) AS BIGINT) FROM pass p JOIN segment s ON s.pass_id = p.id
+    pub async fn counts_of_live_jobs(&self) -> Result<Vec<(String, Counts)>> {
+        let sql = "SELECT p.job_id, CAST(SUM(s.n_ready) AS BIGINT), CAST(SUM(s.n_leased) AS BIGINT), CAST(SUM(s.n_done) AS BIGINT),
+                CAST(SUM(s.n_failed) AS BIGINT), CAST(SUM(s.n_skipped) AS BIGINT)
+            FROM pass p JOIN segment s ON s.pass_id = p.id
             WHERE p.kind = $1 AND p.job_id IN (SELECT job_id FROM pass WHERE state = $2 AND state <= 2 AND kind = $1) GROUP BY p.job_id";
         let rows = self.query(sql, values![PassKind::Bake.code(), PassState::Open.code()]).await?;
-        rows.iter().map(|row| Ok((row.text(0)?, PaceSample { at: now, done: row.int(1)? }))).collect()
+        rows.iter().map(|row| Ok((row.text(0)?, super::view::counts(row, 1)?))).collect()
     }
 }
 

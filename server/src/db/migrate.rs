@@ -5,7 +5,7 @@ use crate::error::Kind;
 use crate::{Error, Result, values};
 
 /// For each version, from 1: SQLite's script and PostgreSQL's.
-const MIGRATIONS: [(&str, &str); 5] = [
+const MIGRATIONS: [(&str, &str); 6] = [
     (
         include_str!("../../../migrations/sqlite/0001_queue.sql"),
         include_str!("../../../migrations/postgres/0001_queue.sql"),
@@ -25,6 +25,10 @@ const MIGRATIONS: [(&str, &str); 5] = [
     (
         include_str!("../../../migrations/sqlite/0005_trust.sql"),
         include_str!("../../../migrations/postgres/0005_trust.sql"),
+    ),
+    (
+        include_str!("../../../migrations/sqlite/0006_traced.sql"),
+        include_str!("../../../migrations/postgres/0006_traced.sql"),
     ),
 ];
 

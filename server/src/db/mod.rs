@@ -24,6 +24,7 @@ mod plans;
 pub mod postgres;
 pub mod retention;
 pub mod sqlite;
+pub mod traced;
 pub mod truth;
 pub mod view;
 pub mod worker;

@@ -47,7 +47,7 @@ pub(super) fn summary(row: &Row) -> Result<JobSummary> {
     })
 }
 
-fn counts(row: &Row, first: usize) -> Result<Counts> {
+pub(super) fn counts(row: &Row, first: usize) -> Result<Counts> {
     Ok(Counts {
         ready: row.int(first)?,
         leased: row.int(first + 1)?,
@@ -93,9 +93,12 @@ impl Store {
             FROM pass p LEFT JOIN segment s ON s.pass_id = p.id WHERE p.job_id = $1
             GROUP BY p.id, p.kind, p.name, p.state, p.reused, p.created_at, p.ended_at, p.result, p.kept_done, p.kept_failed,
                 p.kept_skipped ORDER BY p.id";
-        let pass = |row: &Row| {
+        let mut traced = self.traced_of(job).await?;
+        let mut pass = |row: &Row| {
+            let id = row.int(0)?;
             Ok(PassDetail {
-                id: row.int(0)?,
+                id,
+                traced: traced.remove(&id),
                 kind: row.word(1, PassKind::from_code)?,
                 name: row.text(2)?,
                 state: row.word(3, PassState::from_code)?,
@@ -107,7 +110,7 @@ impl Store {
                 batch_ms: row.int(13)?,
             })
         };
-        self.query(sql, values![job]).await?.iter().map(pass).collect()
+        self.query(sql, values![job]).await?.iter().map(&mut pass).collect()
     }
 
     /// Mean milliseconds of a batch of the latest bakes; none where there was no bake.
@@ -221,7 +224,10 @@ impl Store {
                 w.reason
             FROM worker w ORDER BY w.name LIMIT 10000";
         let rows = self.query(sql, values![now - crate::scheduler::failure::SICK_MS]).await?;
-        let worker = |row: &Row| {
+        let mut latest = self.latest_traced().await?;
+        let mut worker = |row: &Row| {
+            let name = row.text(0)?;
+            let (device, traced) = latest.remove(&name).map(|work| (work.device, work.traced)).unzip();
             let (leased, last_seen) = (row.int(8)?, row.int(7)?);
             let state = match () {
                 () if now - last_seen >= WORKER_LOST_MS => "lost",
@@ -232,7 +238,9 @@ impl Store {
                 () => "idle",
             };
             Ok(WorkerDetail {
-                name: row.text(0)?,
+                name,
+                device: device.unwrap_or_default(),
+                traced,
                 state: state.into(),
                 labels: serde_json::from_str(&row.text(1)?)?,
                 memory_bytes: row.int(2)?,
@@ -243,6 +251,6 @@ impl Store {
                 last_seen,
             })
         };
-        rows.iter().map(worker).collect()
+        rows.iter().map(&mut worker).collect()
     }
 }

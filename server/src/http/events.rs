@@ -11,9 +11,11 @@ use axum::response::sse::{self, Sse};
 use futures_util::Stream;
 use protocol::events::Event;
 use protocol::limits::EVENT_REPLAY_MAX;
+use protocol::overview::JobProgress;
 use serde::Deserialize;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
+use tokio::time::Instant;
 use utoipa::IntoParams;
 
 use super::Api;
@@ -36,10 +38,14 @@ pub struct EventsQuery {
     job: Option<String>,
     /// Those after this event, as the header `Last-Event-ID`.
     after: Option<i64>,
+    /// How far live jobs are, too.
+    #[serde(default)]
+    progress: bool,
 }
 
 /// Events as they happen (`text/event-stream`; the data of each is an `Event`). Those after `Last-Event-ID` come first; if
-/// there are too many, an event `reset` says so. An event `bye` says that this coordinator ends.
+/// there are too many, an event `reset` says so. With `progress=true`, an event `progress`, which has no number and is not
+/// sent again, says how far a live job is: its data is a `JobProgress`, twice a second at most. An event `bye` says that this coordinator ends.
 #[utoipa::path(get, path = "/v1/events", tag = "jobs", security(("token" = ["viewer"])), params(EventsQuery),
     responses((status = 200, body = Event, content_type = "text/event-stream")))]
 pub async fn events(
@@ -51,6 +57,7 @@ pub async fn events(
     let project = caller.project_or(query.project.as_deref())?.map(str::to_owned);
     // Listen first, then look back: nothing falls between
     let receiver = api.coordinator.events.subscribe();
+    let progress = query.progress.then(|| api.coordinator.progress.subscribe());
     let latest = api.coordinator.store.last_event().await?;
     let header = headers.get("last-event-id").and_then(|id| id.to_str().ok()?.parse().ok());
     let after = header.or(query.after);
@@ -69,12 +76,22 @@ pub async fn events(
         project,
         job: query.job,
         receiver,
+        progress,
         last,
         waiting,
+        beat_at: Instant::now() + BEAT,
         behind: last < latest,
         ended: false,
     };
     Ok(Sse::new(futures_util::stream::unfold(listener, Listener::next)))
+}
+
+/// The next frame for those who asked for frames; never for others.
+async fn next_frame(progress: &mut Option<Receiver<JobProgress>>) -> Result<JobProgress, RecvError> {
+    match progress {
+        Some(progress) => progress.recv().await,
+        None => std::future::pending().await,
+    }
 }
 
 /// Somebody who listens.
@@ -84,9 +101,12 @@ struct Listener {
     project: Option<String>,
     job: Option<String>,
     receiver: Receiver<Event>,
+    progress: Option<Receiver<JobProgress>>,
     /// The last event that was looked at.
     last: i64,
     waiting: VecDeque<sse::Event>,
+    /// When the next comment is due, however much is told until then.
+    beat_at: Instant,
     /// Whether there are events that only the database has.
     behind: bool,
     ended: bool,
@@ -117,8 +137,14 @@ impl Listener {
                     Err(RecvError::Lagged(_)) => self.behind = true,
                     Err(RecvError::Closed) => self.ended = true,
                 },
+                frame = next_frame(&mut self.progress) => match frame {
+                    Ok(frame) => self.take_progress(&frame),
+                    // The next frame says what the one that is lost did
+                    Err(RecvError::Lagged(_)) => {}
+                    Err(RecvError::Closed) => self.ended = true,
+                },
                 () = stopped => self.bye(),
-                () = tokio::time::sleep(BEAT) => self.beat().await,
+                () = tokio::time::sleep_until(self.beat_at) => self.beat().await,
             }
         }
     }
@@ -130,6 +156,7 @@ impl Listener {
 
     /// Sends a comment, unless the token is over.
     async fn beat(&mut self) {
+        self.beat_at = Instant::now() + BEAT;
         if let Some(token) = &self.caller.token {
             let found = self.api.coordinator.store.token(&token.detail.id).await;
             let now = self.api.coordinator.now();
@@ -160,9 +187,22 @@ impl Listener {
         }
     }
 
+    /// Whether what happens to a job of a project is to be told.
+    fn wants(&self, project: &str, job: Option<&String>) -> bool {
+        self.project.as_ref().is_none_or(|wanted| wanted == project)
+            && self.job.as_ref().is_none_or(|wanted| job == Some(wanted))
+    }
+
+    fn take_progress(&mut self, frame: &JobProgress) {
+        if self.wants(&frame.project, Some(&frame.job))
+            && let Ok(data) = serde_json::to_string(frame)
+        {
+            self.waiting.push_back(sse::Event::default().event("progress").data(data));
+        }
+    }
+
     fn take(&mut self, event: &Event) {
-        let wanted = self.project.as_ref().is_none_or(|project| *project == event.project)
-            && self.job.as_ref().is_none_or(|job| event.job.as_ref() == Some(job));
+        let wanted = self.wants(&event.project, event.job.as_ref());
         if event.id <= self.last {
             return;
         }

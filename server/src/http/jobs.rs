@@ -16,6 +16,7 @@ use super::Api;
 use super::access::Caller;
 use super::extract::{Json, Path, Query};
 use super::overview::live;
+use crate::coordinator::pace::doing;
 use crate::coordinator::submit::Submitter;
 use crate::db::list::{JobList, JobSort};
 use crate::scheduler::waiting::{Question, reason};
@@ -150,10 +151,12 @@ pub async fn job(
     let passes = coordinator.store.pass_details(&id).await?;
     let backing_off = coordinator.store.backing_off(&id, now).await?;
     let question = Question { job: &id, state: summary.state, backing_off };
-    let waiting = coordinator.read_farm(|farm| reason(farm, &question, now));
+    let (waiting, workers) = coordinator
+        .read_farm(|farm| (reason(farm, &question, now), farm.jobs.get(&id).map_or(0, |job| job.leases)));
+    let at_pace = doing(&coordinator.pace, &id, &summary.batches, waiting).left_ms;
     let recent_ms = coordinator.store.recent_batch_ms().await?;
     Ok(Json(JobDetail {
-        left_ms: left_ms(&passes),
+        left_ms: at_pace.or_else(|| left_ms(&passes, workers)),
         left_worker_ms: left_worker_ms(&passes, recent_ms),
         settings: request.settings,
         depends_on: request.depends_on,
@@ -165,13 +168,13 @@ pub async fn job(
     }))
 }
 
-/// Milliseconds until the bake passes are done at their present pace; none where there is none.
-fn left_ms(passes: &[PassDetail]) -> Option<i64> {
+/// Milliseconds until so many workers are done with the bake passes, by what their batches took; none where none has ended.
+fn left_ms(passes: &[PassDetail], workers: i64) -> Option<i64> {
     let bakes = || passes.iter().filter(|pass| pass.kind == PassKind::Bake);
-    let leased: i64 = bakes().map(|pass| pass.batches.leased).sum();
     let known = bakes().any(|pass| pass.batch_ms > 0);
     let work: i64 = bakes().map(|pass| pass.batches.open().saturating_mul(pass.batch_ms)).sum();
-    (known && leased > 0).then(|| work / leased)
+    // A worker has several batches and bakes one at a time
+    (known && workers > 0).then(|| work / workers)
 }
 
 /// Milliseconds of one worker for the batches that are left; none before they are counted, or where no pace is known.

@@ -91,6 +91,8 @@ fn operations() -> OpenApiRouter<Arc<Api>> {
         .routes(routes!(overview::job_picture))
         .routes(routes!(overview::picture))
         .routes(routes!(overview::preview))
+        .routes(routes!(overview::work))
+        .routes(routes!(overview::provisional))
         .routes(routes!(overview::skies))
         // Assets
         .routes(routes!(bytes::missing_assets))

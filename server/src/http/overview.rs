@@ -9,14 +9,18 @@ use axum::response::{IntoResponse, Response};
 use engine::relight::{Environment, Sky, Window};
 use glam::DMat3;
 use protocol::job::{JobSummary, Output};
-use protocol::overview::{FarmDetail, JobNow, LeaseDetail, PaceSample, ProjectUse};
-use protocol::{JobState, WaitReason, limits};
+use protocol::overview::{FarmDetail, JobNow, LeaseDetail, PaceSample, ProjectUse, Provisional};
+use protocol::traced::PassWork;
+use protocol::{JobState, WaitReason, keys, limits};
+use serde::Deserialize;
+use utoipa::IntoParams;
 
 use super::Api;
 use super::access::Caller;
 use super::bytes::outgoing;
-use super::extract::{Json, Path, range};
+use super::extract::{Json, Path, Query, range};
 use crate::coordinator::Coordinator;
+use crate::coordinator::pace::doing;
 use crate::error::Kind;
 use crate::scheduler::farm::Farm;
 use crate::scheduler::waiting::{Question, reason};
@@ -30,10 +34,8 @@ pub fn live(coordinator: &Coordinator, jobs: &[JobSummary]) -> BTreeMap<String, 
     let now = coordinator.now();
     let one = |farm: &Farm, job: &JobSummary| {
         let question = Question { job: &job.id, state: job.state, backing_off: 0 };
-        let per_minute = coordinator.pace.per_minute(&job.id);
-        let left = |rate: f64| (job.batches.open() as f64 / rate * 60_000.0) as i64;
-        let left_ms = per_minute.filter(|rate| *rate > 0.0).map(left);
-        (job.id.clone(), JobNow { waiting: reason(farm, &question, now), per_minute, left_ms })
+        let waiting = reason(farm, &question, now);
+        (job.id.clone(), doing(&coordinator.pace, &job.id, &job.batches, waiting))
     };
     coordinator
         .read_farm(|farm| jobs.iter().filter(|job| !job.state.is_final()).map(|job| one(farm, job)).collect())
@@ -106,6 +108,18 @@ pub async fn pace(
     Ok(Json(samples))
 }
 
+/// Who traced how much of a job, and what that took; those that reported last come first, a thousand at most.
+#[utoipa::path(get, path = "/v1/jobs/{id}/work", tag = "jobs", security(("token" = ["viewer"])),
+    params(("id" = String, Path)), responses((status = 200, body = Vec<PassWork>)))]
+pub async fn work(
+    State(api): State<Arc<Api>>,
+    caller: Caller,
+    Path(id): Path<String>,
+) -> Result<Json<Vec<PassWork>>> {
+    let job = api.job(&caller, &id).await?;
+    api.coordinator.store.work(&job.id, limits::PAGE_MAX).await.map(Json)
+}
+
 /// A picture of a decorated stream, PNG.
 #[utoipa::path(get, path = "/v1/jobs/{id}/outputs/{name}/picture", tag = "jobs", security(("token" = ["viewer"])),
     params(("id" = String, Path), ("name" = String, Path)),
@@ -133,23 +147,53 @@ pub async fn job_picture(
     send_picture(&api, &output, &headers).await
 }
 
+/// What there is to see of a bake that is under way: previews of the parts that are committed, at most half a minute old.
+/// `made_at` of one is the `made` of its preview.
+#[utoipa::path(get, path = "/v1/jobs/{id}/provisional", tag = "jobs", security(("token" = ["viewer"])),
+    params(("id" = String, Path)), responses((status = 200, body = Vec<Provisional>)))]
+pub async fn provisional(
+    State(api): State<Arc<Api>>,
+    caller: Caller,
+    Path(id): Path<String>,
+) -> Result<Json<Vec<Provisional>>> {
+    let job = api.job(&caller, &id).await?;
+    api.coordinator.provisional(&job).await.map(Json)
+}
+
+/// Which preview.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub struct PreviewQuery {
+    /// Of a bake that is under way: the pass, and when the preview was made, as `provisional` says.
+    pass: Option<i64>,
+    /// See `pass`.
+    made: Option<i64>,
+}
+
 /// The preview of a decorated stream (`docs/formats-preview.md`), or the range of it that the header `Range` asks for.
 #[utoipa::path(get, path = "/v1/jobs/{id}/outputs/{name}/preview", tag = "jobs", security(("token" = ["viewer"])),
-    params(("id" = String, Path), ("name" = String, Path)),
+    params(("id" = String, Path), ("name" = String, Path), PreviewQuery),
     responses((status = 200, content_type = "application/octet-stream"), (status = 206)))]
 pub async fn preview(
     State(api): State<Arc<Api>>,
     caller: Caller,
     Path((job, name)): Path<(String, String)>,
+    Query(query): Query<PreviewQuery>,
     headers: HeaderMap,
 ) -> Result<Response> {
-    let output = api.published(&caller, &job, Some(&name)).await?;
-    if !output.preview {
-        return Err(Error::not_found("preview of output", &name));
-    }
+    let key = match query.pass.zip(query.made) {
+        Some((pass, made)) => keys::provisional(&api.job(&caller, &job).await?.id, pass, made),
+        None => {
+            let output = api.published(&caller, &job, Some(&name)).await?;
+            if !output.preview {
+                return Err(Error::not_found("preview of output", &name));
+            }
+            beside(&output, "preview")
+        }
+    };
     let range = range(&headers);
     let is_part = range.is_some();
-    let sent = api.coordinator.storage.send(&beside(&output, "preview"), range).await?;
+    let sent = api.coordinator.storage.send(&key, range).await?;
     Ok(outgoing(sent, is_part, None))
 }
 

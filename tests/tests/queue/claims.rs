@@ -1,7 +1,10 @@
 //! Claims, results, leases that run out.
 
-use protocol::work::Verdict;
+use protocol::traced::Traced;
+use protocol::work::{CompleteItem, Verdict};
 use protocol::{BatchState, FailureClass};
+
+use server::db::claim::Granted;
 
 use crate::{Queue, TTL, all_done, done, on_both};
 
@@ -10,7 +13,8 @@ on_both! {
     racing_claims_never_overlap
     /// Catches a result of a lease that ran out, one that counts twice, and an answer that makes a worker repeat itself.
     results_count_once_and_only_under_the_current_fence
-    /// Catches a lease that outlives its time, ends before it, or ends while its worker is heard of.
+    /// Catches a lease that outlives its time, ends before it, or ends while its worker is heard of; and a worker that is
+    /// taken for idle when its lease ran out.
     leases_last_as_long_as_heartbeats_come
     /// Catches leases that run out while the coordinator was away.
     a_restart_forgives
@@ -26,6 +30,9 @@ on_both! {
     a_new_process_ends_the_leases_of_the_old
     /// Catches a merge that published a damaged part.
     damaged_parts_are_baked_again
+    /// Catches figures of a result that did not count, or that counted twice, and sums that are mixed up between workers,
+    /// passes and jobs.
+    what_tracing_took_is_summed_once
     /// Catches a broken worker, and a broken job, that burn the farm.
     broken_workers_rest_and_storms_pause
 }
@@ -85,6 +92,8 @@ async fn results_count_once_and_only_under_the_current_fence(mut queue: Queue) {
 
 async fn leases_last_as_long_as_heartbeats_come(mut queue: Queue) {
     let bake = queue.baking("j", 10).await;
+    queue.register("w1").await;
+    queue.register("w2").await;
     let kept = queue.claim("w1", bake.pass, 0, 1).await.unwrap().lease;
     let silent = queue.claim("w2", bake.pass, 0, 1).await.unwrap().lease;
     queue.now += TTL - 1;
@@ -93,7 +102,11 @@ async fn leases_last_as_long_as_heartbeats_come(mut queue: Queue) {
     assert_eq!((extended, ended), (vec![kept.clone()], vec![silent]), "w2's lease is not w1's to extend");
     assert!(queue.store.expire(&queue.around(9)).await.unwrap().is_empty());
     queue.now += 2;
-    assert_eq!(queue.store.expire(&queue.around(9)).await.unwrap().len(), 1);
+    let ended = queue.store.expire(&queue.around(9)).await.unwrap();
+    assert_eq!(ended.iter().map(|ended| ended.lost_worker.as_deref()).collect::<Vec<_>>(), [Some("w2")]);
+    let workers = queue.store.workers(queue.now).await.unwrap();
+    let states: Vec<_> = workers.iter().map(|worker| (&*worker.name, &*worker.state)).collect();
+    assert_eq!(states, [("w1", "busy"), ("w2", "lost")], "who is silent is lost at once");
     queue.now += TTL;
     assert_eq!(queue.store.expire(&queue.around(9)).await.unwrap().len(), 1);
     let (extended, ended) =
@@ -235,4 +248,42 @@ async fn broken_workers_rest_and_storms_pause(queue: Queue) {
     assert_eq!(storms, ["20 failures of class `crash` among its first batches"]);
     assert!(queue.store.job("j").await.unwrap().paused);
     assert!(queue.claim("w9", bake.pass, 7, 1).await.is_none(), "a paused job is not claimed from");
+}
+
+async fn what_tracing_took_is_summed_once(mut queue: Queue) {
+    let (one, other) = (queue.baking("j", 4).await, queue.baking("k", 2).await);
+    let figures = |number: i64| Traced::from_array(std::array::from_fn(|at| number * (at as i64 + 1)));
+    let traced = |granted: &Granted, i, number| CompleteItem {
+        traced: Some(figures(number)),
+        ..done(granted, i, "ab")
+    };
+    let first = queue.claim("w1", one.pass, 0, 2).await.unwrap();
+    let items = [traced(&first, 0, 10), traced(&first, 1, 20)];
+    queue.complete("w1", one.pass, &first, &items).await;
+    // The same again, a failure, and a result that comes too late
+    queue.complete("w1", one.pass, &first, &items).await;
+    let late = queue.claim("w1", one.pass, 0, 1).await.unwrap();
+    queue.now += TTL + 1;
+    queue.store.expire(&queue.around(9)).await.unwrap();
+    queue.complete("w1", one.pass, &late, &[traced(&late, 0, 1_000)]).await;
+    let second = queue.claim("w2", one.pass, 0, 1).await.unwrap();
+    queue.complete("w2", one.pass, &second, &[traced(&second, 0, 100)]).await;
+    let third = queue.claim("w2", other.pass, 0, 1).await.unwrap();
+    queue.now += 1;
+    queue.complete("w2", other.pass, &third, &[traced(&third, 0, 3)]).await;
+
+    let sum = |batches, number| Traced { batches, ..figures(number) };
+    let work = queue.store.work("j", 9).await.unwrap();
+    let found: Vec<_> = work.iter().map(|work| (&*work.worker, &*work.device, work.traced)).collect();
+    assert_eq!(found, [("w2", "cpu", sum(1, 100)), ("w1", "cpu", sum(2, 30))]);
+    let passes = queue.store.pass_details("j").await.unwrap();
+    let bake = passes.iter().find(|pass| pass.id == one.pass).unwrap();
+    assert_eq!(bake.traced, Some(sum(3, 130)));
+    assert!(passes.iter().filter(|pass| pass.id != one.pass).all(|pass| pass.traced.is_none()));
+    // A worker's figures are those of the pass that it was at last
+    queue.register("w1").await;
+    queue.register("w2").await;
+    let workers = queue.store.workers(queue.now).await.unwrap();
+    let found: Vec<_> = workers.iter().map(|worker| (&*worker.name, worker.traced)).collect();
+    assert_eq!(found, [("w1", Some(sum(2, 30))), ("w2", Some(sum(1, 3)))]);
 }

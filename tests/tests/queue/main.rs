@@ -173,6 +173,7 @@ impl Queue {
             pass,
             session: worker,
             worker,
+            device: "cpu",
             around: self.around(9),
             opinion_every: self.opinion_every,
         };
@@ -233,7 +234,7 @@ pub(crate) fn built() -> PassResult {
 pub(crate) fn done(granted: &Granted, i: usize, sha256: &str) -> CompleteItem {
     let outcome = Outcome::Done { sha256: sha256.repeat(32), bytes: 10, result: None };
     let batch = granted.batches[i];
-    CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms: 100, outcome }
+    CompleteItem { batch: batch.batch, fence: batch.fence, elapsed_ms: 100, traced: None, outcome }
 }
 
 pub(crate) fn all_done(granted: &Granted) -> Vec<CompleteItem> {

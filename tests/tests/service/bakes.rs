@@ -5,6 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use engine::bake::{BakeOptions, Control, Quiet, bake};
+use engine::preview::Preview;
+use protocol::overview::Provisional;
 use protocol::{JobState, PassKind, Role};
 use worker::client::Client;
 use worker::run::{Options, run};
@@ -32,8 +34,13 @@ pub fn options(client: Client, name: &str, folder: &Path) -> Options {
 
 /// What one process makes of the scene.
 pub fn quiet_bake(folder: &Path) {
+    quiet_bake_of(folder, SCENE);
+}
+
+/// What one process makes of a scene.
+pub fn quiet_bake_of(folder: &Path, scene: &str) {
     std::fs::create_dir_all(folder.join("models")).unwrap();
-    std::fs::write(folder.join("scene.xml"), SCENE).unwrap();
+    std::fs::write(folder.join("scene.xml"), scene).unwrap();
     std::fs::write(folder.join("models/tent.obj"), TENT).unwrap();
     let scene = engine::scene::load(&folder.join("scene.xml")).unwrap();
     let control = Control { progress: &Quiet, cancel: &AtomicBool::new(false) };
@@ -106,7 +113,7 @@ fn see(people: &Client, job: &str, output: &protocol::job::Output, path: &Path) 
     assert!(output.preview && output.picture, "{output:?}");
     let url = |what: &str| people.own(&format!("/v1/jobs/{job}/outputs/{}/{what}", output.name));
     people.download(&url("preview"), path, 1 << 30).unwrap();
-    let mut preview = engine::preview::Preview::open(path).unwrap();
+    let mut preview = Preview::open(path).unwrap();
     assert_eq!((preview.header.points, preview.header.baked), (output.baked, output.baked));
     let mut bytes = Vec::new();
     (0..preview.nodes.len()).for_each(|node| preview.read(node, &mut bytes).unwrap());
@@ -153,6 +160,59 @@ fn events(service: &super::Service, job: &str, after: i64) -> Vec<(i64, String)>
         }
     }
     found
+}
+
+/// Catches a bake that is seen otherwise while it is under way than when it is done: other points, numbers in another order,
+/// parts that are matched with the points of other batches.
+#[test]
+fn a_bake_is_seen_before_it_is_merged() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let service = super::Service::start(folder, None);
+    let people = service.client(Role::Submitter);
+    let mut request = service.request(&people);
+    // Batches of 4,096 points, of which some are left out
+    request.settings.samples = Some(256);
+    request.settings.max_points = Some(9_000);
+    let job = people.submit(&request, "one").unwrap().jobs.remove(0);
+    let sofar = || -> Vec<Provisional> {
+        serde_json::from_str(&people.text(&format!("/v1/jobs/{job}/provisional")).unwrap()).unwrap()
+    };
+    assert_eq!(sofar(), [], "nothing is baked yet");
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let options = options(service.client(Role::Worker), "w1", folder);
+        let worker = scope.spawn(|| run(&{ options }, &stop));
+        wait_for(&people, std::slice::from_ref(&job));
+        stop.store(true, Ordering::SeqCst);
+        worker.join().unwrap().unwrap();
+    });
+    let found = sofar();
+    assert_eq!(found.len(), 2, "{found:?}");
+    for Provisional { name, pass, done, batches, points, made_at } in found {
+        assert_eq!((done, points > 0), (batches, true), "{name}");
+        let preview = |query: &str| {
+            let path = folder.join("fetched.preview");
+            let url = people.own(&format!("/v1/jobs/{job}/outputs/{name}/preview{query}"));
+            people.download(&url, &path, 1 << 30).unwrap();
+            let mut preview = Preview::open(&path).unwrap();
+            let mut root = Vec::new();
+            preview.read(0, &mut root).unwrap();
+            (preview.header, root)
+        };
+        let (before, first) = preview(&format!("?pass={pass}&made={made_at}"));
+        let (after, second) = preview("");
+        assert_eq!((before.points, before.points), (points, after.points), "{name}");
+        assert_eq!((before.bands, before.weight, before.domain), (after.bands, after.weight, after.domain));
+        // The same points in the same order; positions are rounded from another corner, and a plan knows no albedo
+        let numbers = |root: &[u8]| -> Vec<Vec<u8>> {
+            root.chunks_exact(before.record_bytes())
+                .map(|record| [&record[6..10], &record[14..]].concat())
+                .collect()
+        };
+        assert_eq!(numbers(&first), numbers(&second), "{name}");
+        assert!((before.corner - after.corner).length() < 1e-4 * after.edge, "{before:?} {after:?}");
+    }
 }
 
 /// Catches a job that waits for ever after the job before it is done.

@@ -85,8 +85,13 @@ fn a_lease_reaches_its_own_objects_only() {
         let path = format!("/v1/jobs/{job}/passes/{}/batches/{}/log", claimed.pass, batch.batch);
         assert_eq!(people.text(&path).unwrap(), "a line\n");
         let outcome = Outcome::Done { sha256: "0".repeat(64), bytes: 5, result: None };
-        let item = CompleteItem { batch: batch.batch, fence, elapsed_ms: 1, outcome };
-        let report = CompleteRequest { session: session.clone(), pass: claimed.pass, items: vec![item] };
+        let item = CompleteItem { batch: batch.batch, fence, elapsed_ms: 1, traced: None, outcome };
+        let report = CompleteRequest {
+            session: session.clone(),
+            pass: claimed.pass,
+            device: String::new(),
+            items: vec![item],
+        };
         assert!(!client.complete(&claimed.lease, &report).unwrap().lease_live);
         let failures = people.failures(&job).unwrap();
         assert_eq!(failures.len(), 1);

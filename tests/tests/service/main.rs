@@ -53,11 +53,16 @@ struct Service {
 impl Service {
     /// Starts one whose objects are below `folder`; its database is a SQLite file there unless another is given.
     fn start(folder: &Path, database: Option<String>) -> Self {
+        Self::start_with(folder, |settings| settings.database = database.unwrap_or(settings.database.clone()))
+    }
+
+    /// Starts one with other settings than usual.
+    fn start_with(folder: &Path, change: impl FnOnce(&mut Settings)) -> Self {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let runtime = runtime.expect("a runtime");
         let mut settings = Settings::local(folder, "127.0.0.1:0".parse().expect("an address"));
-        settings.database = database.unwrap_or(settings.database);
         settings.connections = 8;
+        change(&mut settings);
         let (end, ended) = oneshot::channel::<()>();
         let (coordinator, url, served) = runtime.block_on(async {
             let coordinator = Coordinator::open(settings).await.expect("the coordinator opens");

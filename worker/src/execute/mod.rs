@@ -18,6 +18,7 @@ use engine::brickmap::BrickMap;
 use engine::scene::Roots;
 use engine::{ErrorKind, bake::set::SetBake};
 use protocol::storage::{FolderFile, FolderIndex};
+use protocol::traced::Traced;
 use protocol::work::{Claim, ClaimedBatch, PassResult, SetMap, Task};
 use protocol::{PassKind, keys};
 
@@ -65,13 +66,28 @@ pub struct Finished {
     pub result: PassResult,
 }
 
+/// A batch's part, and what it took.
+#[derive(Clone, Copy, Debug)]
+pub struct Baked<'a> {
+    /// The encoded part, empty for a batch without points.
+    pub bytes: &'a [u8],
+    /// How long it took.
+    pub elapsed: Duration,
+    /// What there is to say about it.
+    pub log: &'a str,
+    /// What traced: `cpu`, or the names of adapters.
+    pub device: &'a str,
+    /// What tracing took.
+    pub traced: Traced,
+}
+
 /// Where parts go.
 pub trait PartSink {
-    /// Takes the encoded part of a batch, empty for a batch without points. Whether the next one is wanted.
+    /// Takes the part of a batch. Whether the next one is wanted.
     ///
     /// # Errors
     /// When it cannot be kept.
-    fn part(&mut self, batch: ClaimedBatch, bytes: &[u8], elapsed: Duration, log: &str) -> Result<bool>;
+    fn part(&mut self, batch: ClaimedBatch, baked: Baked<'_>) -> Result<bool>;
 
     /// A batch begins; with it, `left` are left of the claim.
     fn begins(&mut self, _left: usize) {}

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use engine::bake::{BakeOptions, Control, Quiet};
 use engine::scene::Roots;
@@ -12,7 +11,7 @@ use protocol::storage::{FolderFile, SceneFiles};
 use protocol::work::{Claim, ClaimedBatch, PartEntry, PartPage, PassResult, Task};
 use protocol::{FailureClass, PassKind, keys};
 
-use super::{Executor, PartSink, Work};
+use super::{Baked, Executor, PartSink, Work};
 use crate::cache::Cache;
 use crate::depot::{Depot, Wanted};
 use crate::{Error, Result, digest};
@@ -96,8 +95,17 @@ struct Committer<'a> {
 }
 
 impl PartSink for Committer<'_> {
-    fn part(&mut self, batch: ClaimedBatch, bytes: &[u8], _: Duration, log: &str) -> Result<bool> {
+    fn part(
+        &mut self,
+        batch: ClaimedBatch,
+        Baked { bytes, log, device, traced, .. }: Baked<'_>,
+    ) -> Result<bool> {
         assert!(log.starts_with("traced "));
+        // 16 rays or more for each point, and what it asked of the arena
+        assert_eq!((device, traced.batches), ("cpu", 1));
+        assert!(traced.rays >= 16 * traced.points && traced.trace_us > 0, "{traced:?}");
+        assert!(traced.brick_requests >= traced.brick_misses, "{traced:?}");
+        assert_eq!(traced.brick_misses == 0, traced.read_bytes == 0, "{traced:?}");
         let content = digest::of_bytes(bytes);
         let key = keys::part(&self.job, self.pass, batch.batch, batch.fence, &content.sha256);
         let path = self.depot.root.join(key);

@@ -6,12 +6,14 @@ use std::time::Instant;
 use engine::bake::tracer::BatchTracer;
 use engine::bake::work::BakeWork;
 use engine::batch::BatchPlan;
+use engine::cut::arena::ArenaCounts;
 use engine::output::Part;
+use protocol::traced::Traced;
 use protocol::work::ClaimedBatch;
 
 use super::bricks::RemoteBricks;
 use super::inputs::Reads;
-use super::{Executor, PartSink, Work, need};
+use super::{Baked, Executor, PartSink, Work, need};
 use crate::Result;
 use crate::cache::{Entry, Folder};
 
@@ -48,6 +50,7 @@ impl Executor {
             let start = Instant::now();
             bytes.clear();
             let mut totals = BakeWork::default();
+            let arena = bench.tracer.arena_counts();
             if let Some(planned) = bench.planned(batch) {
                 let next = claimed.get(number + 1).copied();
                 let next = next.or_else(|| sink.upcoming(work.claim.pass));
@@ -61,7 +64,10 @@ impl Executor {
             tracing::debug!("{}", log.trim_end());
             drop(span);
             work.control.progress.update("trace", (number + 1) as f64 / claimed.len() as f64, "");
-            if !sink.part(batch, &bytes, start.elapsed(), &log)? {
+            let points = if bytes.is_empty() { 0 } else { part.indices.len() };
+            let traced = traced(&totals, points, [arena, bench.tracer.arena_counts()]);
+            let (elapsed, device) = (start.elapsed(), bench.tracer.device());
+            if !sink.part(batch, Baked { bytes: &bytes, elapsed, log: &log, device, traced })? {
                 break;
             }
         }
@@ -83,6 +89,25 @@ impl Executor {
         let folders = [plan_folder, map_folder];
         let (pass, used) = (work.claim.pass, self.used.clone());
         Ok(Bench { pass, tracer, batches, bricks, _folders: folders, used })
+    }
+}
+
+/// What tracing one batch took; `arena` is what the arena had done before it and after it.
+fn traced(totals: &BakeWork, points: usize, [before, after]: [ArenaCounts; 2]) -> Traced {
+    let whole = |count: u64| i64::try_from(count).unwrap_or(i64::MAX);
+    // An arena that is made anew begins to count anew
+    let added = |of: fn(&ArenaCounts) -> u64| whole(of(&after).saturating_sub(of(&before)));
+    let microseconds = |seconds: f64| (1e6 * seconds).round() as i64;
+    Traced {
+        batches: 1,
+        points: whole(points as u64),
+        rays: whole(totals.rays),
+        trace_us: microseconds(totals.seconds),
+        brick_requests: added(|counts| counts.requests),
+        brick_misses: added(|counts| counts.misses),
+        read_bytes: added(|counts| counts.read_bytes),
+        device_bytes: whole(totals.device_bytes()),
+        device_us: microseconds(totals.device_seconds()),
     }
 }
 
