@@ -5,9 +5,7 @@ use std::time::Duration;
 use protocol::keys;
 use protocol::limits::{CLAIM_MAX, MESSAGE_BYTES_MAX, cut};
 use protocol::storage::FolderFile;
-use protocol::work::{
-    ClaimedBatch, CompleteItem, CompleteReply, CompleteRequest, LogRequest, Outcome, Verdict,
-};
+use protocol::work::{CompleteItem, CompleteReply, CompleteRequest, LogRequest, Outcome, Verdict};
 
 use crate::client::Client;
 use crate::depot::Depot;

@@ -1,5 +1,7 @@
 //! Retention: what is fenced off is not referred to, and counts outlive the rows they count.
 
+use std::sync::Arc;
+
 use protocol::{PassKind, PassState};
 use server::db::garbage::UnusedAsset;
 use server::db::retention::{Aged, DAY_MS, Life, Retention};
@@ -95,7 +97,7 @@ async fn assets_go_only_when_nobody_comes(queue: Queue) {
 
     // A job comes between the look and the removal
     let mut job = crate::new_job("j", None);
-    job.request.files.insert("f".into(), a.clone());
+    Arc::make_mut(&mut job.request).files.insert("f".into(), a.clone());
     queue.store.submit(&[job.clone()], now).await.unwrap();
     assert!(!queue.store.drop_asset(&asset, now + 1, now).await.unwrap());
     assert!(queue.store.missing_assets("default", std::slice::from_ref(&a)).await.unwrap().is_empty());

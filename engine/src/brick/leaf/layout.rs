@@ -192,8 +192,10 @@ impl Layout {
         if self.stride == 0 {
             return self.stored_index(leaf, face, corner);
         }
-        let first =
-            if self.columns > 0 { face + face / self.columns } else { self.stored_index(leaf, face, 0) };
+        let first = match face.checked_div(self.columns) {
+            Some(row) => face + row,
+            None => self.stored_index(leaf, face, 0),
+        };
         first + [0, 1, self.stride + 1, self.stride][corner]
     }
 
