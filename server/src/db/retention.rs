@@ -274,6 +274,7 @@ impl Store {
         let own = "SELECT id FROM job WHERE id = $1 AND deleted = 1 AND work_gone = 2 AND logs_gone = 2 AND outputs_gone = 2";
         for sql in [
             format!("DELETE FROM dependency WHERE job_id IN ({own}) OR needs IN ({own})"),
+            format!("DELETE FROM traced WHERE pass_id IN (SELECT id FROM pass WHERE job_id IN ({own}))"),
             format!("DELETE FROM pass WHERE job_id IN ({own})"),
             format!("DELETE FROM job WHERE id IN ({own})"),
         ] {
