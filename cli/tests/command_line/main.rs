@@ -256,7 +256,7 @@ fn failed_work_says_why_and_leaves_nothing() {
     fails(["import", &empty, "-o", &out], "no geometry", None);
     fails(["import", &desk.at("none.ply"), "-o", &out], "none.ply", None);
     fails(["import", &stream, &broken, "-o", &out], "broken.obj:1", None);
-    fails(["import", &stream, "-o", &out, "--dice", "world:x"], "how to dice", Some("world:0.01"));
+    fails(["import", &stream, "-o", &out, "--dice", "world:x"], "no way to dice", Some("world:0.01"));
     fails(["import", &desk.at("a.fbx"), "-o", &out], "not a format", Some(".gltf"));
     fails(["inspect", &desk.at("none.mgs")], "none.mgs", None);
     fails(["inspect", &broken], "broken.obj", Some("pantaray import"));
