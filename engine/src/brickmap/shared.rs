@@ -296,11 +296,12 @@ mod tests {
     #[test]
     fn overlap_counts_copies() {
         let bounds = Bounds { min: DVec3::splat(-1.0), max: DVec3::ONE };
+        // Well inside the cells, so that rounding moves none to another
         let rows = |spacing: f64, scale: f64| -> Vec<DMat4> {
             let at = |i: i32| DVec3::new(f64::from(i % 16), f64::from(i / 16 % 16), f64::from(i / 256));
             (0..4096)
                 .map(|i| {
-                    DMat4::from_translation(at(i) * spacing * scale + 5e5)
+                    DMat4::from_translation(at(i) * spacing * scale + (5e5 + 0.7 * scale))
                         * DMat4::from_scale(DVec3::splat(scale))
                 })
                 .collect()

@@ -58,8 +58,8 @@ impl Coordinator {
         request.name = edits.name.clone().unwrap_or(request.name);
         request.priority = edits.priority.unwrap_or(summary.priority);
         request.comment = edits.comment.clone().unwrap_or(summary.comment);
-        // One frame of a range is one job
-        request.frames = None;
+        // One frame of a range is one job; and whoever submits a job again wants it to run
+        (request.frames, request.paused) = (None, false);
         self.submit_as(&request, submitter, Some(job)).await
     }
 
