@@ -22,7 +22,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use protocol::events::Event;
 use protocol::overview::JobProgress;
 use protocol::work::Task;
-use tokio::sync::{Notify, broadcast};
+use tokio::sync::{Notify, Semaphore, broadcast};
 
 use crate::clock::Clock;
 use crate::config::Settings;
@@ -50,6 +50,8 @@ pub struct Coordinator {
     farm: RwLock<Farm>,
     /// Workers that wait for work.
     waiting: AtomicUsize,
+    /// Turns to choose and to claim: whoever chooses sees what those before have taken.
+    turns: Semaphore,
     wake: Notify,
     /// Jobs that may have a step to take.
     pending: Mutex<BTreeSet<String>>,
@@ -100,6 +102,7 @@ impl Coordinator {
             clock,
             farm,
             waiting: AtomicUsize::new(0),
+            turns: Semaphore::new(work::CLAIMS_AT_ONCE),
             wake: Notify::new(),
             pending: Mutex::default(),
             tick: Notify::new(),

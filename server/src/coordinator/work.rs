@@ -28,6 +28,9 @@ const SESSION_MS: i64 = 60_000;
 const REMEMBERED_MAX: usize = 65_536;
 /// Milliseconds for which a segment that gave nothing is left alone.
 const EMPTY_MS: i64 = 500;
+/// Claims that choose a segment and ask the database for it at once. All that wait are woken together: if all chose at once, all
+/// would choose the same.
+pub(super) const CLAIMS_AT_ONCE: usize = 8;
 /// The longest sleep of a claim that waits: a wake-up may have been another coordinator's to give.
 const POLL: Duration = Duration::from_secs(5);
 
@@ -123,7 +126,7 @@ impl Coordinator {
         let mut crowded = 0;
         loop {
             if self.is_stopping() {
-                return Err(Error::new(Kind::Unavailable, "this coordinator is about to end"));
+                return Err(stopping());
             }
             let mut woken = std::pin::pin!(self.wake.notified());
             woken.as_mut().enable();
@@ -148,9 +151,10 @@ impl Coordinator {
         }
     }
 
-    /// What there is for a worker; if nothing, whether only others were at it.
+    /// What there is for a worker; if nothing, whether there was something and others were faster.
     async fn try_claim(&self, request: &ClaimRequest, session: &Session) -> Result<(Option<Claim>, bool)> {
         let start = Instant::now();
+        let _turn = self.turns.acquire().await.map_err(|_| stopping())?;
         let warm: Vec<(i64, i64)> = request.warm.iter().take(8).map(|w| (w.pass, w.segment)).collect();
         let (candidates, alive) = self
             .read_farm(|farm| {
@@ -162,7 +166,7 @@ impl Coordinator {
                 Some((choose(farm, &asker, now, random::bits()), farm.alive(now)))
             })
             .unwrap_or_default();
-        let mut is_busy = false;
+        let is_busy = !candidates.is_empty();
         for candidate in candidates {
             let claimer = Claimer {
                 worker: &session.worker,
@@ -174,10 +178,7 @@ impl Coordinator {
             let (ttl, now) = (self.settings.lease_ttl_ms, self.now());
             let granted = match self.store.claim(&candidate, from_tail, &claimer, ttl, now).await? {
                 Taken::Granted(granted) => granted,
-                Taken::Busy => {
-                    is_busy = true;
-                    continue;
-                }
+                Taken::Busy => continue,
                 Taken::Empty => {
                     self.write_farm(|farm| {
                         farm.was_empty(candidate.pass, candidate.segment, now + EMPTY_MS);
@@ -337,6 +338,10 @@ fn log(completion: &Completion, worker: &str, pass: i64, items: &[CompleteItem])
             }
         }
     }
+}
+
+fn stopping() -> Error {
+    Error::new(Kind::Unavailable, "this coordinator is about to end")
 }
 
 /// Counts a claim among those that wait for as long as it lives.
