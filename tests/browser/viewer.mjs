@@ -100,13 +100,13 @@ export async function viewer(page, job, twin, view) {
   });
   await readable(page, "viewer");
   const shots = new Set();
-  for (const show of ["lit", "sky", "bent", "band0", "band1", "band2", "normal"]) {
+  for (const show of ["lit", "sky", "bent", "band0", "band1", "band2", "normal", "error"]) {
     await page.selectOption("select[aria-label=Show]", show);
     await page.waitForTimeout(250);
     shots.add((await page.locator(".viewer-stage").screenshot()).toString("base64"));
-    if (show === "sky" || show === "bent") await keep(page, `viewer-${show}`);
+    if (["sky", "bent", "error"].includes(show)) await keep(page, `viewer-${show}`);
   }
-  check(shots.size === 7, `${shots.size} of 7 views differ`);
+  check(shots.size === 8, `${shots.size} of 8 views differ`);
 
   // A point says its numbers, and light that turns changes them
   await page.selectOption("select[aria-label=Show]", "lit");

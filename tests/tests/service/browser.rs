@@ -142,6 +142,9 @@ fn a_scene_is_baked_and_relit_in_the_browser() {
     let folder = folder.path();
     // Some 30 batches: enough for a worker to die among them
     let scene = SCENE.replace("value=\"16\"", "value=\"512\"").replace("20000", "60000");
+    let coefficients = r#"<attribute name="sh" shader="occlusion"/>"#;
+    let error = r#"<attribute name="sh_error" shader="occlusion" output="error"/>"#;
+    let scene = scene.replace(coefficients, &format!("{coefficients} {error}"));
     bakes::quiet_bake_of(folder, &scene);
     let (lit, dropped) = pictures(folder);
     let service = Service::start_with(folder, |settings| settings.lease_ttl_ms = 4_000);
