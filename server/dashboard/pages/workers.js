@@ -35,7 +35,7 @@ export async function show(main, context) {
   const columns = [
     { name: "State", className: "c-state", render: (worker) => pill(worker.state) },
     { name: "Worker", className: "c-name", render: (worker) => h("span", { class: "two" }, h("strong", {}, worker.name), h("small", {}, [worker.version && `version ${worker.version}`, ...worker.labels].filter(Boolean).join(" · ") || "no labels")) },
-    { name: "Now", className: "c-now", render: (worker) => (worker.lease ? h("span", { class: "two" }, h("a", { href: `/jobs/${worker.lease.job}` }, worker.lease.job_name), h("small", {}, `${worker.lease.kind} ${worker.lease.kind === "build" ? "" : worker.lease.name}, segment ${worker.lease.segment}`)) : h("span", { class: "quiet" }, "–")) },
+    { name: "Now", className: "c-now", render: (worker) => (worker.lease ? h("span", { class: "two" }, h("a", { href: `/jobs/${worker.lease.job}` }, worker.lease.job_name), h("small", {}, `${worker.lease.kind} ${worker.lease.kind === "build" ? "" : worker.lease.name}, segment ${worker.lease.segment}`)) : h("span", { class: "quiet", title: worker.reason ?? "" }, worker.reason || "–")) },
     { name: "For", className: "c-number", render: (worker) => (worker.lease ? h("span", { title: `${count(worker.leased)} batches` }, span(now() - worker.lease.granted_at)) : "–") },
     { name: "Device", className: "c-device", render: (worker) => h("span", { class: "two", title: worker.device }, h("span", {}, worker.device || "not known yet"), h("small", {}, worker.memory_bytes ? `${bytes(worker.memory_bytes)} of memory` : "")) },
     { name: "Rays", className: "c-number", render: (worker) => raysPerSecond(worker.traced) ?? "–" },

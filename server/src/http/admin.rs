@@ -1,11 +1,13 @@
 //! What administrators ask: workers, tokens, tickets, projects, the audit; and enrolment, for which a ticket is enough.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 
-use axum::extract::State;
+use axum::extract::{ConnectInfo, State};
 use axum::http::StatusCode;
 use protocol::admin::{
-    AuditPage, EnrolRequest, Project, Secret, TicketRequest, TokenDetail, TokenRequest, WorkerDetail,
+    AuditEntry, AuditPage, EnrolRequest, Project, Secret, TicketRequest, TokenDetail, TokenRequest,
+    WorkerDetail,
 };
 use protocol::{Role, limits};
 use serde::Deserialize;
@@ -170,7 +172,11 @@ pub async fn create_ticket(
 /// Trades a ticket for a token of the worker's own. What is wrong with a ticket is not told.
 #[utoipa::path(post, path = "/v1/enrol", tag = "admin", security(()),
     request_body = EnrolRequest, responses((status = 200, body = Secret)))]
-pub async fn enrol(State(api): State<Arc<Api>>, Json(request): Json<EnrolRequest>) -> Result<Json<Secret>> {
+pub async fn enrol(
+    State(api): State<Arc<Api>>,
+    address: Option<axum::Extension<ConnectInfo<SocketAddr>>>,
+    Json(request): Json<EnrolRequest>,
+) -> Result<Json<Secret>> {
     if !limits::is_name(&request.name) {
         return Err(Error::invalid("a worker's name has letters, digits, `-`, `_`, `.` and `=`, up to 100"));
     }
@@ -203,7 +209,17 @@ pub async fn enrol(State(api): State<Arc<Api>>, Json(request): Json<EnrolRequest
         last_used_at: None,
     };
     let sha256 = sha256(secret.as_bytes());
+    let entry = AuditEntry {
+        id: 0,
+        at: now,
+        actor: detail.label.clone(),
+        token: Some(id.clone()),
+        address: address.map_or_else(String::new, |address| address.0.0.ip().to_string()),
+        action: "POST /v1/enrol".into(),
+        status: 200,
+    };
     store.add_token(&Token { detail, sha256, worker: Some(request.name), labels, parent: None }).await?;
+    store.add_audit(&entry).await?;
     Ok(Json(Secret { id, secret }))
 }
 

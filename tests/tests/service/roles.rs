@@ -79,7 +79,7 @@ fn tokens_end_and_projects_are_apart() {
     assert!(actions.contains(&format!("POST /v1/tokens/{id}/revoke").as_str()), "{actions:?}");
 }
 
-/// Catches a ticket that works once too often, and a worker's token that works under another name.
+/// Catches a ticket that works once too often, and a worker's token that works under another name; an enrolment of which nobody hears.
 #[test]
 fn tickets_make_tokens_for_one_name() {
     let folder = tempfile::tempdir().unwrap();
@@ -99,4 +99,8 @@ fn tickets_make_tokens_for_one_name() {
     assert_eq!(ask(&url("/v1/workers"), "POST", token, Some(register("w1"))).0, 200);
     let (_, workers) = ask(&url("/v1/workers"), "GET", Some(&admin), None);
     assert_eq!(workers[0]["labels"], json!(["room=3"]), "{workers}");
+    let (_, audit) = ask(&url("/v1/audit"), "GET", Some(&admin), None);
+    let entry = audit["entries"].as_array().unwrap().iter().find(|entry| entry["action"] == "POST /v1/enrol");
+    let entry = entry.unwrap_or_else(|| panic!("{audit}"));
+    assert_eq!((&entry["actor"], &entry["token"]), (&json!("worker w1"), &worker["id"]));
 }
