@@ -1,6 +1,6 @@
 //! The tracer beside Embree: same scene, points, directions and threads, alternating in one run.
 //!
-//! `cargo bench -p engine --bench embree -- [--scene NAME]... [--lod LOD]... [--library PATH] [--farfield KIND] [--threads N]
+//! `cargo bench -p engine --bench embree -- [--scene NAME]... [--lod LOD]... [--embree PATH] [--farfield KIND] [--threads N]
 //! [--repeats N] [--maps FOLDER]`
 //!
 //! Embree 4 is found at run time (`libembree4.so.4` by default; the library inside the Python wheel `embreex` serves as
@@ -39,7 +39,7 @@ const NAME: &str = "bench";
 struct Arguments {
     scenes: Vec<String>,
     lods: Vec<Lod>,
-    library: String,
+    embree: String,
     threads: usize,
     repeats: usize,
     batches: usize,
@@ -54,7 +54,7 @@ impl Arguments {
         let mut read = Self {
             scenes: Vec::new(),
             lods: Vec::new(),
-            library: "libembree4.so.4".into(),
+            embree: "libembree4.so.4".into(),
             threads: 1,
             repeats: 3,
             batches: 3,
@@ -69,7 +69,7 @@ impl Arguments {
             match word.as_str() {
                 "--scene" => read.scenes.push(value()),
                 "--lod" => read.lods.push(Lod::parse(&value()).expect("a level of detail")),
-                "--library" => read.library = value(),
+                "--embree" => read.embree = value(),
                 "--threads" => read.threads = value().parse().expect("a number"),
                 "--repeats" => read.repeats = value().parse().expect("a number"),
                 "--batches" => read.batches = value().parse().expect("a number"),
@@ -120,7 +120,7 @@ fn compare(name: &str, stream: &mut dyn MicrogridStream, arguments: &Arguments) 
     let batches = batches(stream, arguments.batches);
     let kept = arguments.maps.as_ref().map(|maps| maps.join(format!("{name}-{:?}", arguments.far_field)));
     let map = build_map(stream, kept.as_deref().unwrap_or(folder.path()), arguments.far_field);
-    let (triangles, embree) = embree(stream, &arguments.library);
+    let (triangles, embree) = embree(stream, &arguments.embree);
     let shader = ShOcclusion { samples: arguments.rays, ..ShOcclusion::default() };
     let bench = Bench { map, batches, shader, threads: arguments.threads };
     let rays: u64 = bench.batches.iter().map(|b| b.len() as u64 * u64::from(arguments.rays)).sum();
