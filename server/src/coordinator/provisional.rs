@@ -94,13 +94,14 @@ impl Coordinator {
         let made_at = self.now();
         let setting = self.setting(job, &task).await?;
         let table = self.table(&plan).await?;
-        let points_max = task.settings.max_points;
+        // The batches that the settings leave out have no number in the pass
+        let kept = task.settings.max_points.map(|points| table.evenly_spaced(points));
         let reads = stream::iter(parts).map(|part| {
-            // The batches that the settings leave out have no number in the pass
-            let number = points_max.map_or(usize::try_from(part.batch).ok(), |points| {
-                let batches = table.evenly_spaced(points);
-                batches.get(usize::try_from(part.batch).ok()?).map(|&batch| batch as usize)
-            });
+            let number = usize::try_from(part.batch).ok();
+            let number = match &kept {
+                Some(kept) => number.and_then(|number| kept.get(number)).map(|&batch| batch as usize),
+                None => number,
+            };
             self.read_batch(&job.id, pass.id, part, &plan, number.map(|number| (number, &table)))
         });
         let batches: Vec<_> = reads.buffered(READS).try_collect().await?;

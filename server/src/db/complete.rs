@@ -106,6 +106,10 @@ impl Store {
             self.complete_done(&mut tx, counting, items, &mut completion, &mut tally).await?;
             self.complete_failed(&mut tx, reporter, &context, items, &mut completion, &mut tally).await?;
         }
+        if !completion.distrusted.is_empty() {
+            self.distrust(&mut tx, &context, &completion, reporter.around.now).await?;
+            completion.advances = true;
+        }
         if completion.traced.batches > 0 {
             let whose = (context.pass, reporter.worker);
             self.add_traced(&mut tx, whose, reporter.device, completion.traced, reporter.around.now).await?;

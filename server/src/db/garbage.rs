@@ -71,22 +71,24 @@ impl Store {
     /// # Errors
     /// When the database refuses.
     pub async fn attempted(&self, job: &str, after: (i64, i64), limit: i64) -> Result<Vec<Attempted>> {
-        let sql = "SELECT b.pass_id, p.kind, b.seq, b.fence, CASE WHEN b.state = 2 THEN b.sha256 END
-            FROM pass p JOIN batch b ON b.pass_id = p.id
-            WHERE p.job_id = $1 AND (b.pass_id > $2 OR (b.pass_id = $2 AND b.seq > $3))
-                AND (b.fence > 1 OR (b.fence = 1 AND b.state <> 2))
-            ORDER BY b.pass_id, b.seq LIMIT $4";
-        let rows = self.query(sql, values![job, after.0, after.1, limit]).await?;
-        let attempted = |row: &super::Row| {
-            Ok(Attempted {
-                pass: row.int(0)?,
-                kind: row.word(1, PassKind::from_code)?,
-                batch: row.int(2)?,
-                fence: row.int(3)?,
-                sha256: row.text_or_null(4)?,
-            })
-        };
-        rows.iter().map(attempted).collect()
+        let sql = "SELECT id, kind FROM pass WHERE job_id = $1 AND id >= $2 ORDER BY id";
+        let mut found = Vec::new();
+        for row in self.query(sql, values![job, after.0]).await? {
+            let (pass, kind) = (row.int(0)?, row.word(1, PassKind::from_code)?);
+            let left = limit - found.len() as i64;
+            if left == 0 {
+                break;
+            }
+            // Pass by pass, so that every page begins where the last one ended
+            let sql = "SELECT seq, fence, CASE WHEN state = 2 THEN sha256 END FROM batch
+                WHERE pass_id = $1 AND seq > $2 AND (fence > 1 OR (fence = 1 AND state <> 2)) ORDER BY seq LIMIT $3";
+            let last = if pass == after.0 { after.1 } else { -1 };
+            for row in self.query(sql, values![pass, last, left]).await? {
+                let (batch, fence, sha256) = (row.int(0)?, row.int(1)?, row.text_or_null(2)?);
+                found.push(Attempted { pass, kind, batch, fence, sha256 });
+            }
+        }
+        Ok(found)
     }
 
     /// Marks objects.

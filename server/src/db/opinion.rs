@@ -85,11 +85,27 @@ impl Store {
                 held.push(item.batch);
             }
         }
-        for distrusted in &completion.distrusted {
-            self.distrust(tx, context, distrusted, reporter.around.now).await?;
-            completion.advances = true;
-        }
         Ok(held)
+    }
+
+    /// Locks workers; what they hold is over, and what they did in bakes that go on is baked again by others. After the report
+    /// in which that came out was taken in: it may be one of theirs.
+    pub(super) async fn distrust(
+        &self,
+        tx: &mut Tx,
+        context: &Context,
+        completion: &Completion,
+        now: i64,
+    ) -> Result<()> {
+        // Leases first, as everywhere. From this commit on no report on them counts, whoever ends them, and when
+        for Distrusted { worker, .. } in &completion.distrusted {
+            let sql = "UPDATE lease SET session = 'over', expires_at = 0 WHERE worker = $1";
+            tx.execute(sql.into(), values![worker]).await?;
+        }
+        for distrusted in &completion.distrusted {
+            self.lock_and_redo(tx, context, distrusted, now).await?;
+        }
+        Ok(())
     }
 
     /// What becomes of one result beside what others said of its batch; none if the batch is not the lease's any more.
@@ -200,8 +216,8 @@ impl Store {
         Ok(())
     }
 
-    /// Locks a worker; what it did in bakes that go on is baked again by others.
-    async fn distrust(
+    /// Locks a worker, and opens its batches of bakes that go on.
+    async fn lock_and_redo(
         &self,
         tx: &mut Tx,
         context: &Context,
@@ -217,7 +233,7 @@ impl Store {
         let sql = "UPDATE worker SET locked = 1, reason = $2 WHERE name = $1";
         tx.execute(sql.into(), values![worker, reason]).await?;
         self.record_job(tx, &context.job, "worker.distrusted", worker, reason, now).await?;
-        let sql = "SELECT id FROM pass WHERE kind = $1 AND state = $2 ORDER BY id";
+        let sql = "SELECT id FROM pass WHERE kind = $1 AND state = $2 AND state <= 2 ORDER BY id";
         let values = values![PassKind::Bake.code(), PassState::Open.code()];
         for row in tx.query(sql.into(), values).await? {
             let pass = row.int(0)?;

@@ -3,13 +3,15 @@
 use super::{Store, Value};
 
 /// Statements of the loops and of workers.
-const SOURCES: [(&str, &str); 6] = [
+const SOURCES: [(&str, &str); 8] = [
     ("claim", include_str!("claim.rs")),
     ("complete", include_str!("complete.rs")),
     ("control", include_str!("control.rs")),
     ("farm", include_str!("farm.rs")),
     ("graph", include_str!("graph.rs")),
     ("lease", include_str!("lease.rs")),
+    ("opinion", include_str!("opinion.rs")),
+    ("traced", include_str!("traced.rs")),
 ];
 
 /// Tables that grow with what has been done.

@@ -1,6 +1,6 @@
 //! Second opinions: what is baked twice before it counts, and who is not believed any more.
 
-use protocol::work::{CompleteItem, Outcome};
+use protocol::work::{CompleteItem, Outcome, Verdict};
 use protocol::{BatchState, FailureClass, PassState};
 use server::db::claim::Granted;
 use server::db::complete::Completion;
@@ -80,7 +80,15 @@ async fn who_is_outvoted_is_locked_and_redone(queue: Queue) {
     let (_, split) = queue.say(3, "w2", bake.pass, "bb").await;
     assert!(split.diverged && split.distrusted.is_empty());
     assert_eq!(queue.states("j", bake.pass).await, [BatchState::Done, BatchState::Ready, BatchState::Ready]);
+    // What the wrong one is at when that comes out does not count, whatever it says
+    let other = queue.baking("k", 2).await;
+    let held = queue.claim_among(3, "w2", other.pass, 0, 1).await.unwrap();
     let (_, decided) = queue.say(3, "w3", bake.pass, "aa").await;
+    let late = queue.complete("w2", other.pass, &held, &[done(&held, 0, "bb")]).await;
+    assert_eq!(late.verdicts, [Verdict::Superseded]);
+    queue.store.end_leases_of("w2", "", &queue.around(9)).await.unwrap();
+    assert_eq!(queue.states("k", other.pass).await, [BatchState::Ready; 2]);
+    assert!(queue.store.drift().await.unwrap().is_empty());
     assert_eq!(decided.distrusted.iter().map(|d| d.worker.as_str()).collect::<Vec<_>>(), ["w2"]);
     assert_eq!(queue.states("j", bake.pass).await, [BatchState::Ready, BatchState::Done, BatchState::Ready]);
     assert_eq!(queue.locked().await, ["w2"]);
@@ -104,6 +112,7 @@ async fn a_disagreement_of_two_ends(queue: Queue) {
     }
     assert_eq!(queue.states("j", bake.pass).await, [BatchState::Failed]);
     assert_eq!(queue.locked().await, ["w1", "w2"]);
+    assert!(queue.store.drift().await.unwrap().is_empty());
 }
 
 async fn nobody_to_ask_is_no_obstacle(queue: Queue) {
